@@ -106,13 +106,13 @@ def _shown(scene: Scene, camera: str, renderer: Renderer, t_s: float) -> Float:
     view = renderer.markers(t_s)
     shown = view.visible.copy()
     rows_s = 0.02  # a marker's row is exposed within this time after row 0
-    joints = scene.joints((t_s + rows_s / 2,))
+    joints = scene.truth(t_s + rows_s / 2).joints
     optics = scene.optics[camera]
     focal_px = float(np.sqrt(optics.matrix[0, 0] * optics.matrix[1, 1]))
     for m, name in enumerate(scene.rig.markers):
         mount = scene.model.mount(name)
         if mount.joint is not None:
-            distance = float(np.linalg.norm(joints.position_m[0, mount.joint] - optics.centre))
+            distance = float(np.linalg.norm(joints.position_m[mount.joint] - optics.centre))
             radius_px = focal_px * float(scene.model.radius_m[mount.joint]) / distance
             shown[m] = view.area[m] / (np.pi * radius_px**2)
     return shown

@@ -1,21 +1,7 @@
 """The one exception tree.
 
-    PhalanxError
-    ├── CalibrationError   a JSON file is missing, broken, or holds something impossible
-    ├── RecordingError     a recording folder cannot be read or written
-    ├── CameraError        a camera is gone, or refused a setting
-    ├── ImuError           an IMU is gone, or nothing here can read it
-    ├── TrackerError       a device that tracks itself is gone, or nothing here can read it
-    │   └── TrackerChoiceError  several are there, and none was selected
-    ├── LightsError        laser or LEDs cannot be switched, or would be on for longer than is safe
-    ├── PictureError       bytes that are no picture, or one of another size
-    ├── MessageError       bytes that are not a message of ours
-    │   └── BoundsError    a message with a number that cannot be
-    ├── BusError           the bus cannot be opened, or nobody answers
-    └── FitError           observations do not determine the value asked for
-
-A bad datagram raises nothing: `common.link.datagram` counts it by reason. `ValueError` stays
-what it is everywhere: the caller passed something of the wrong shape or range.
+A bad datagram raises nothing: `common.link.datagram` counts it by reason. `ValueError` stays what it is everywhere: the
+caller passed something of the wrong shape or range.
 """
 
 

@@ -3,55 +3,66 @@
 from collections.abc import Mapping
 from functools import cache
 from types import SimpleNamespace
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
 R = TypeVar("R")
-Shape = int | tuple[int, ...]
 
 
-def record(kind: type[R], **fields: Shape | tuple[str, Shape] | tuple[object, int] | object) -> R:
-    """Allocate a struct of arrays with fixed shapes, all zero.
+class _Field(NamedTuple):
+    kind: Any  # data type of numpy, or class of a record
+    shape: tuple[int | str, ...]
+
+
+def array(*shape: int | str, kind: str = "f8") -> Any:
+    """Declare an array of a record, its shape in numbers and in names of sizes.
+
+    Args:
+        shape: A name may have a factor or an offset: "3M" is three times the size M, "6+n" six more than n.
+        kind: Data type of numpy.
+    """
+    return _Field(kind, shape)
+
+
+def part(kind: type, *count: int) -> Any:
+    """Declare a field that is a record itself, or so many of them."""
+    return _Field(kind, count)
+
+
+def record(kind: type[R], **sizes: int) -> R:
+    """Allocate a struct of arrays, all zero.
 
     Args:
         kind: A class that declares the fields; never called.
-        fields: Shape of each, of float64; or data type and shape; or another record, which is copied into it; or one
-            and how many of its kind there are, all zero.
+        sizes: Of the names in their shapes, those of nested records included.
     """
-    types: list[tuple[str, Any] | tuple[str, Any, Any]] = []
-    for name, of in fields.items():
-        if isinstance(of, np.void):
-            types.append((name, cast(Any, of.dtype)))
-        elif isinstance(of, tuple) and isinstance(cast(Any, of)[0], np.void):
-            one, count = cast(tuple[np.void, int], of)
-            types.append((name, cast(Any, one.dtype), (count,)))
-        elif isinstance(of, tuple) and isinstance(cast(Any, of)[0], str):
-            kind_of, shape = cast(tuple[str, Shape], of)
-            types.append((name, kind_of, shape if isinstance(shape, tuple) else (shape,)))
-        else:
-            types.append((name, "f8", cast(Any, of if isinstance(of, tuple) else (of,))))
-    out = np.zeros(1, _layout(tuple(types))).view(np.recarray)[0]
-    for name, of in fields.items():
-        if isinstance(of, np.void):
-            out[name] = of
-    return cast(R, out)
+    return cast(R, np.zeros(1, _layout(kind, tuple(sizes.items()))).view(np.recarray)[0])
 
 
 @cache
-def _layout(types: tuple[Any, ...]) -> np.dtype[Any]:
-    """Layout of records with these fields, one object: quick to compare."""
-    return np.dtype(list(types), align=True)
+def _layout(kind: type, sizes: tuple[tuple[str, int], ...]) -> np.dtype[Any]:
+    """Layout of a record, one object: quick to compare."""
+    size_of, layout = dict(sizes), list[Any]()
+    for name, field in vars(kind).items():
+        if isinstance(field, _Field):
+            shape = tuple(_size(one, size_of) if isinstance(one, str) else one for one in field.shape)
+            nested = isinstance(field.kind, type)
+            layout.append((name, (np.record, _layout(field.kind, sizes)) if nested else field.kind, shape))
+    return np.dtype(layout, align=True)
 
 
-def filled(kind: type[R], values: Mapping[str, Any]) -> R:
-    """Return a record of copies of arrays; integers and booleans keep their type."""
-    types = {"i": "i8", "u": "u1", "b": "u1"}
-    fields = {name: (types.get(value.dtype.kind, "f8"), value.shape) for name, value in values.items()}
-    out = record(kind, **fields)
+def _size(name: str, size_of: Mapping[str, int]) -> int:
+    offset, _, product = name.rpartition("+")
+    symbol = product.lstrip("0123456789")
+    return int(offset or 0) + int(product.removesuffix(symbol) or 1) * size_of[symbol]
+
+
+def filled(one: R, **values: Any) -> R:
+    """Copy arrays, or one number for all, into the fields of a record; return it."""
     for name, value in values.items():
-        cast(Any, out)[name] = value
-    return out
+        cast(Any, one)[name] = value
+    return one
 
 
 def fields(one: R) -> R:

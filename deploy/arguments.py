@@ -1,45 +1,11 @@
-"""Options of `phalanx demo` and of the remote fleet commands, with checks."""
+"""Options of `phalanx demo` and of the remote fleet commands."""
 
 import argparse
 import os
-import re
 from argparse import ArgumentParser
 from pathlib import Path
 
 from deploy.deployment import WAIT_SENDERS_S
-from deploy.remote import DeployError, RigFile
-
-_PREFIXED = re.compile(r"[A-Za-z0-9_.]+=")  # NAME= before a driver or before options
-
-
-def check_wish(options: argparse.Namespace, rig: RigFile) -> None:
-    """Check what `phalanx fleet deploy` can refuse before a machine is asked.
-
-    Raises:
-        DeployError: An option is for a name that the rig does not have, or `--wheelhouse` has no wheels.
-    """
-    for option in ("camera", "options"):
-        for text in getattr(options, option):
-            name = text.partition("=")[0] if _PREFIXED.match(text) else None
-            if name is not None and name not in rig.names:
-                raise DeployError(
-                    f"--{option} {text!r}: rig {rig.name!r} has no {name!r}; it has {', '.join(rig.names)}"
-                )
-    if options.wheelhouse is not None and not any(options.wheelhouse.glob("*.whl")):
-        raise DeployError(
-            f"--wheelhouse {options.wheelhouse}: no wheels in it; phalanx fleet wheels DIR gathers them"
-        )
-
-
-def check_reach(options: argparse.Namespace) -> None:
-    """Raise DeployError where the private key of ssh is not there."""
-    if options.identity is not None and not options.identity.is_file():
-        raise DeployError(f"--identity {options.identity}: no such file; ssh-keygen makes one")
-
-
-def default_keys() -> Path:
-    """Return the default keys folder."""
-    return Path(os.environ.get("PHALANX_KEYS") or Path.home() / ".config/phalanx/keys")
 
 
 def add_demo(demo: ArgumentParser) -> None:
@@ -71,7 +37,7 @@ def add_demo(demo: ArgumentParser) -> None:
         help="the console in the viewer's place: its address is printed, open it in a browser",
     )
     demo.add_argument(
-        "--seconds", type=_positive, default=30.0, metavar="N", help="length (default: %(default)s)"
+        "--seconds", type=_seconds, default=30.0, metavar="N", help="length (default: %(default)s)"
     )
     demo.add_argument("--json", type=Path, metavar="FILE", help="write the summary to FILE as well")
     demo.add_argument(
@@ -146,14 +112,11 @@ def add_deploy(deploy: ArgumentParser) -> None:
     deploy.add_argument("--master", required=True, metavar="HOST", help="this PC, as the machines reach it")
     deploy.add_argument("--rig", default="desk", help="a file of DIR/rigs (default: %(default)s)")
     deploy.add_argument("--role", choices=("camera", "wrist"), help="checked against the rig, if given")
+    overlay = "dtoverlay in config.txt, for cameras that a Raspberry Pi does not find by itself"
     for name, metavar, what in (
         ("camera", "[NAME=]DRIVER", "as `phalanx-slave run --camera` has it (default: picamera2)"),
         ("options", "[NAME=]TEXT", "more options of `phalanx-slave run`, of NAME or of all"),
-        (
-            "overlay",
-            "NAME",
-            "dtoverlay in config.txt, for cameras that a Raspberry Pi does not find by itself",
-        ),
+        ("overlay", "NAME", overlay),
     ):
         deploy.add_argument(f"--{name}", action="append", default=[], metavar=metavar, help=what)
     deploy.add_argument("--imu", metavar="DRIVER", help="as `phalanx-slave run --imu` has it")
@@ -161,7 +124,9 @@ def add_deploy(deploy: ArgumentParser) -> None:
     deploy.add_argument(
         "--calibration", type=Path, default=calibration_tree(), metavar="DIR", help="default: %(default)s"
     )
-    _keys(deploy, "keys folder; made if it is missing")
+    keys = Path(os.environ.get("PHALANX_KEYS") or Path.home() / ".config/phalanx/keys")
+    text = "keys folder; made if it is missing (default: %(default)s)"
+    deploy.add_argument("--keys", type=Path, default=keys, metavar="DIR", help=text)
     deploy.add_argument(
         "--wheelhouse", type=Path, metavar="DIR", help="use these wheels (default: download them)"
     )
@@ -169,8 +134,7 @@ def add_deploy(deploy: ArgumentParser) -> None:
     deploy.add_argument(
         "--no-wait", action="store_true", help="do not wait for datagrams, only until slaves are ready"
     )
-    ready_s = 90.0
-    deploy.add_argument("--ready-s", type=float, default=ready_s, metavar="S", help=argparse.SUPPRESS)
+    deploy.add_argument("--ready-s", type=float, default=90.0, metavar="S", help=argparse.SUPPRESS)
     deploy.add_argument("--wait-s", type=float, default=WAIT_SENDERS_S, metavar="S", help=argparse.SUPPRESS)
     deploy.add_argument(
         "--beacon", metavar="ADDRESS:PORT", help="where slaves listen for the start (default: broadcast)"
@@ -194,8 +158,7 @@ def add_rollback(rollback: ArgumentParser) -> None:
             programs, options, keys and calibration as they were before the last deployment that changed something
       phalanx fleet rollback pi-left.local --dry-run
     """
-    rollback.add_argument("hosts", nargs="+", metavar="HOST", help="by ssh")
-    _reach(rollback)
+    _add_hosts(rollback)
 
 
 def add_uninstall(uninstall: ArgumentParser) -> None:
@@ -206,8 +169,7 @@ def add_uninstall(uninstall: ArgumentParser) -> None:
             services, programs, keys and calibration are gone; what apt brought stays
       phalanx fleet uninstall pi-left.local --dry-run
     """
-    uninstall.add_argument("hosts", nargs="+", metavar="HOST", help="by ssh")
-    _reach(uninstall)
+    _add_hosts(uninstall)
 
 
 def add_wheels(wheels: ArgumentParser) -> None:
@@ -225,14 +187,8 @@ def add_wheels(wheels: ArgumentParser) -> None:
     wheels.add_argument(
         "--python", default="3.13", metavar="VERSION", help="of that machine (default: %(default)s)"
     )
-    wheels.add_argument(
-        "--with",
-        dest="more",
-        action="append",
-        default=[],
-        metavar="REQUIREMENT",
-        help="one more; once for each",
-    )
+    text = "one more; once for each"
+    wheels.add_argument("--with", dest="more", action="append", default=[], metavar="REQUIREMENT", help=text)
 
 
 def calibration_tree() -> Path:
@@ -241,45 +197,28 @@ def calibration_tree() -> Path:
     return here if here.is_dir() else Path(__file__).resolve().parent.parent / "calib_json"
 
 
-def _keys(command: ArgumentParser, what: str) -> None:
-    command.add_argument(
-        "--keys", type=Path, default=default_keys(), metavar="DIR", help=f"{what} (default: %(default)s)"
-    )
+def _add_hosts(command: ArgumentParser) -> None:
+    command.add_argument("hosts", nargs="+", metavar="HOST", help="by ssh")
+    _reach(command)
 
 
 def _reach(command: ArgumentParser) -> None:
     command.add_argument("--dry-run", action="store_true", help="write nothing, print what would be done")
-    deadline_s = 900.0
     command.add_argument(
-        "--deadline", type=_seconds, default=deadline_s, metavar="S", help="for all (default: %(default)g)"
+        "--deadline", type=_seconds, default=900.0, metavar="S", help="for all (default: %(default)g)"
     )
     command.add_argument("--user", metavar="USER", help="of ssh; root, or one with passwordless sudo")
     command.add_argument("--port", type=int, metavar="PORT", help="of ssh")
     command.add_argument("--identity", type=Path, metavar="FILE", help="private key of ssh")
-    command.add_argument(
-        "--ssh-option",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="as `ssh -o` has it; ~/.ssh/config holds, too",
-    )
+    text = "as `ssh -o` has it; ~/.ssh/config holds, too"
+    command.add_argument("--ssh-option", action="append", default=[], metavar="NAME=VALUE", help=text)
 
 
 def _seconds(text: str) -> float:
     try:
         value = float(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text}: must be a number") from error
-    if not 0.0 < value < 1e6:
-        raise argparse.ArgumentTypeError(f"{text}: must be positive")
-    return value
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
     except ValueError as error:  # argparse would print the name of the function
         raise argparse.ArgumentTypeError(f"{text}: must be a number") from error
     if not 0.0 < value < 1e6:
-        raise argparse.ArgumentTypeError("seconds must be positive")
+        raise argparse.ArgumentTypeError(f"{text}: must be positive")
     return value

@@ -1,9 +1,9 @@
 """Commands run the demo, or deploy, roll back and uninstall slaves."""
 
-import argparse
 import contextlib
 import functools
 import json
+import re
 import socket
 import sys
 import tempfile
@@ -12,50 +12,49 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from deploy.arguments import check_reach, check_wish
-from deploy.demo import DemoError, DemoSettings, best_rigs, run_demo, stop_on_signals
+from deploy.demo import DemoSettings, best_rigs, run_demo, stop_on_signals
 from deploy.deployment import (
-    Ears,
-    Lines,
+    DeployRequest,
+    Host,
+    ListenOptions,
     Notify,
-    Reached,
-    Wish,
+    SshOptions,
     deploy,
+    end_all,
+    line_writer,
     make_keys,
-    reach_of,
-    roll_back,
-    uninstall,
 )
 from deploy.payload import Kind, export
 from deploy.remote import DeployError, RigFile, Target, read_rig, targets_of
 
 _EVERYWHERE = "255.255.255.255"  # of the network that --master is in
+_PREFIXED = re.compile(r"[A-Za-z0-9_.]+=")  # NAME= before a driver or before options
 
 
-def rig_of(options: argparse.Namespace) -> RigFile:
-    """Return the rig, which must have the requested role.
+def request_of(options: Namespace, rig: RigFile) -> DeployRequest:
+    """What the options request on the machines of `rig`.
 
     Raises:
-        DeployError: It is not, or lacks an option.
+        DeployError: Another role, an option for a name that the rig does not have, or a wheelhouse without wheels.
     """
-    rig = read_rig(options.calibration, options.rig)
     if options.role is not None and (options.role == "wrist") != (rig.kind == "wrist"):
         raise DeployError(f"--role {options.role}: rig {rig.name!r} is of kind {rig.kind!r}")
-    return rig
-
-
-def wish_of(options: argparse.Namespace, rig: RigFile) -> Wish:
-    """What is wanted on the machines."""
-    check_wish(options, rig)
-    handed = [
-        f"--{name}={one}" for name in ("camera", "options", "overlay") for one in getattr(options, name)
-    ]
-    handed += [
-        f"--{name}={value}"
-        for name in ("role", "imu", "lights")
-        if (value := getattr(options, name)) is not None
-    ]
-    return Wish(
+    for option in ("camera", "options"):
+        for text in getattr(options, option):
+            name = text.partition("=")[0]
+            if _PREFIXED.match(text) and name not in rig.names:
+                raise DeployError(
+                    f"--{option} {text!r}: rig {rig.name!r} has no {name!r}; it has {', '.join(rig.names)}"
+                )
+    if options.wheelhouse is not None and not any(options.wheelhouse.glob("*.whl")):
+        raise DeployError(
+            f"--wheelhouse {options.wheelhouse}: no wheels in it; phalanx fleet wheels DIR gathers them"
+        )
+    repeated = {f"--{name}": getattr(options, name) for name in ("camera", "options", "overlay")}
+    handed = [f"{name}={one}" for name, values in repeated.items() for one in values]
+    single = {f"--{name}": getattr(options, name) for name in ("role", "imu", "lights")}
+    handed += [f"{name}={value}" for name, value in single.items() if value is not None]
+    return DeployRequest(
         options.master,
         rig,
         options.calibration,
@@ -69,27 +68,28 @@ def wish_of(options: argparse.Namespace, rig: RigFile) -> Wish:
     )
 
 
-def ears_of(options: argparse.Namespace) -> Ears | None:
-    """Return how first datagrams are received: here, or at another machine's master."""
+def listen_options(options: Namespace) -> ListenOptions | None:
+    """How first datagrams are received: here, or at another machine's master."""
     if options.no_wait:
         return None
     address = _here(options.master)
     bus_host = "127.0.0.1" if address else options.master
     words = ["--rig", options.rig, "--calibration", str(options.calibration)]
-    beacon_port, data_port, bus_port = 47800, 47801, 47802
-    words += ["--bus", options.bus or f"tls/{bus_host}:{bus_port}"]
-    words += ["--bind", options.bind or f"{address or '0.0.0.0'}:{data_port}"]
+    words += ["--bus", options.bus or f"tls/{bus_host}:47802"]
+    words += ["--bind", options.bind or f"{address or '0.0.0.0'}:47801"]
     default = "127.255.255.255" if (address or "").startswith("127.") else _EVERYWHERE
-    words += ["--beacon", options.beacon or f"{default}:{beacon_port}"]
-    return Ears(tuple(words), options.keys, options.wait_s)
+    words += ["--beacon", options.beacon or f"{default}:47800"]
+    return ListenOptions(tuple(words), options.keys, options.wait_s)
 
 
-def reached_of(options: argparse.Namespace) -> Reached:
-    """How the machines are reached."""
-    check_reach(options)
-    return Reached(
-        reach_of(options.user, options.port, options.identity, options.ssh_option), options.deadline
-    )
+def ssh_options(options: Namespace) -> SshOptions:
+    """How the machines are reached; DeployError: the private key is not there."""
+    if options.identity is not None and not options.identity.is_file():
+        raise DeployError(f"--identity {options.identity}: no such file; ssh-keygen makes one")
+    given = {"-l": options.user, "-p": options.port, "-i": options.identity}
+    words = [word for option, value in given.items() if value for word in (option, str(value))]
+    words += [word for option in options.ssh_option for word in ("-o", option)]
+    return SshOptions(tuple(words), options.deadline)
 
 
 def _here(master: str) -> str | None:
@@ -108,16 +108,10 @@ def _here(master: str) -> str | None:
 
 @contextlib.contextmanager
 def prepared_keys(folder: Path, names: Sequence[str], dry_run: bool, notify: Notify) -> Generator[Path]:
-    """Provide a keys folder that has all that these senders need.
+    """Provide a keys folder that has all that these senders need, or DeployError.
 
-    Args:
-        folder: That of the user; what it lacks is made.
-        dry_run: Nothing is made there. A private folder takes its place meanwhile, so that the rest of the
-            way can be looked at: links to what is there, and what is lacking, made for nobody.
-        notify: Called with what is made.
-
-    Raises:
-        DeployError: They cannot be made.
+    What `folder` lacks is made. In a dry run a private folder takes its place meanwhile, so that the rest of the way
+    can be looked at: links to what is there, and what is lacking, made for nobody.
     """
     if not dry_run:
         make_keys(folder, names, notify)
@@ -126,30 +120,27 @@ def prepared_keys(folder: Path, names: Sequence[str], dry_run: bool, notify: Not
     with tempfile.TemporaryDirectory(prefix="phalanx-keys-") as private:
         keys = Path(private) / "keys"
         make_keys(keys, names, lambda _line: None)
-        lacking = 0
+        lacking = False
         for file in [path for path in keys.rglob("*") if path.is_file()]:
             there = folder / file.relative_to(keys)
             if there.is_file():
                 file.unlink()
                 file.symlink_to(there.resolve())
             else:
-                lacking += 1
+                lacking = True
         if lacking:
             notify(f"would make keys in {folder}")
         yield keys
 
 
-Work = Callable[[Namespace], int]
-
-
-def plainly(work: Work) -> Work:
+def plainly(work: Callable[[Namespace], int]) -> Callable[[Namespace], int]:
     """Make `work` end with one line and exit code 1 on errors the user can fix."""
 
     @functools.wraps(work)
     def run(options: Namespace) -> int:
         try:
             return work(options)
-        except (DemoError, DeployError) as error:
+        except DeployError as error:
             sys.stderr.write(f"phalanx: {error}\n")
             return 1
 
@@ -185,24 +176,24 @@ def demo(options: Namespace) -> int:
 @plainly
 def deploy_slaves(options: Namespace) -> int:
     """Bring slaves to their machines; the exit code."""
-    rig = rig_of(options)
+    rig = read_rig(options.calibration, options.rig)
     targets = targets_of(options.hosts, rig)
-    wish, ears, reached, notify = wish_of(options, rig), ears_of(options), reached_of(options), Lines(_notify)
-    names = [name for target in targets for name in target.names]
+    request, listening, ssh = request_of(options, rig), listen_options(options), ssh_options(options)
+    names, notify = [name for target in targets for name in target.names], line_writer(_notify)
     with prepared_keys(options.keys, names, options.dry_run, notify) as keys:
-        return _judge(deploy(targets, replace(wish, keys=keys), reached, ears, notify))
+        return _judge(deploy(targets, replace(request, keys=keys), ssh, listening, notify))
 
 
 @plainly
 def rollback(options: Namespace) -> int:
     """Bring machines back to what they had; the exit code."""
-    return _judge(roll_back(_all(options.hosts), reached_of(options), options.dry_run, Lines(_notify)))
+    return _end_all(options, lambda host: host.roll_back(options.dry_run))
 
 
 @plainly
 def uninstall_slaves(options: Namespace) -> int:
     """Take slaves from their machines; the exit code."""
-    return _judge(uninstall(_all(options.hosts), reached_of(options), options.dry_run, Lines(_notify)))
+    return _end_all(options, lambda host: host.uninstall(options.dry_run))
 
 
 @plainly
@@ -214,9 +205,9 @@ def wheels(options: Namespace) -> int:
     return 0
 
 
-def _all(hosts: Sequence[str]) -> list[Target]:
-    """Machines, whatever they serve."""
-    return [Target(host, ()) for host in dict.fromkeys(hosts)]
+def _end_all(options: Namespace, act: Callable[[Host], str]) -> int:
+    targets = [Target(host, ()) for host in dict.fromkeys(options.hosts)]  # whatever they serve
+    return _judge(end_all(targets, ssh_options(options), act, line_writer(_notify)))
 
 
 def _judge(results: dict[str, str | None]) -> int:

@@ -21,7 +21,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, cast
 
+from deploy.deployment import make_keys
 from deploy.process import Process
+from deploy.remote import DeployError, RigFile, read_rig
 
 SensorKind = Literal["camera", "imu", "tracker"]
 
@@ -33,10 +35,6 @@ _BEST = {
     "object": ("desk-wand",),
     "gestures": ("desk4",),  # fingers that bend towards one pair are seen by the other
 }
-
-
-class DemoError(Exception):
-    """A demo that cannot run; the text states why and what to do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,20 +56,20 @@ def sensors_of(calibration: Path, rigs: tuple[str, ...], scene: str) -> list[Sen
     """Return cameras of all rigs, then placed IMUs, then trackers on objects.
 
     Raises:
-        DemoError: A rig cannot be read, two have a sensor of the same name, or rigs of one hand would each
+        DeployError: A rig cannot be read, two have a sensor of the same name, or rigs of one hand would each
             see another.
     """
-    read = {name: _rig(calibration, name) for name in rigs}
+    read = {name: read_rig(calibration, name) for name in rigs}
     if len(read) < len(rigs):
-        raise DemoError(f"--rig {' --rig '.join(rigs)}: a rig stands twice")
+        raise DeployError(f"--rig {' --rig '.join(rigs)}: a rig stands twice")
     moves, _, light = scene.partition("@")
     hands = [rig.hand for rig in read.values()]
     if len(set(hands)) < len(hands) and moves not in TOGETHER:
-        raise DemoError(
+        raise DeployError(
             f"--scene {scene}: rigs {', '.join(read)} see one hand together only in {', '.join(TOGETHER)}"
         )
     if moves == "object" and not any(rig.objects for rig in read.values()):
-        raise DemoError(
+        raise DeployError(
             f"--scene object: rig {', '.join(read)} tracks no object; --rig desk-wand or desk-cube does"
         )
     has_wrist_rig = any(rig.kind == "wrist" for rig in read.values())
@@ -80,12 +78,13 @@ def sensors_of(calibration: Path, rigs: tuple[str, ...], scene: str) -> list[Sen
         # The light behind the @ is that of a wrist device; cameras that watch markers have their own.
         own = moves if light and has_wrist_rig and rig.kind == "markers" else scene
         found["camera"] += [Sensor(one, name, own) for one in rig.cameras]
-        found["imu"] += [Sensor(one, name, own, "imu") for one in rig.imus]
-        found["tracker"] += [Sensor(one, name, own, "tracker") for one in rig.trackers]
+        if rig.imu is not None and rig.imu_placed:
+            found["imu"].append(Sensor(rig.imu, name, own, "imu"))
+        found["tracker"] += [Sensor(one, name, own, "tracker") for one in _trackers(calibration, rig)]
     sensors = [*found["camera"], *found["imu"], *found["tracker"]]
     names = [sensor.name for sensor in sensors]
     if twice := [name for name in names if names.count(name) > 1]:
-        raise DemoError(
+        raise DeployError(
             f"rigs {', '.join(read)}: {twice[0]!r} stands twice; every sensor has a name of its own"
         )
     return sensors
@@ -96,36 +95,13 @@ def rig_options(rigs: tuple[str, ...]) -> list[str]:
     return [word for rig in rigs for word in ("--rig", rig)]
 
 
-@dataclass(frozen=True, slots=True)
-class _Rig:
-    """A rig file, as far as it matters here."""
-
-    kind: str
-    hand: str
-    cameras: list[str]
-    imus: list[str]
-    objects: list[str]
-    trackers: list[str]
-
-
-def _rig(calibration: Path, name: str) -> _Rig:
-    path = calibration / "rigs" / f"{name}.json"
+def _trackers(calibration: Path, rig: RigFile) -> list[str]:
+    """The trackers on the objects of a rig."""
+    files = [calibration / "objects" / f"{one}.json" for one in rig.objects]
     try:
-        rig = json.loads(path.read_text())
-        imu = cast(dict[str, object], rig.get("imu") or {})
-        placed = imu.get("q_palm_imu") is not None and imu.get("q_rig_world") is not None
-        imus = [str(imu.get("name", "imu"))] if placed else []
-        objects = cast(list[str], rig.get("objects") or [])
-        files = [calibration / "objects" / f"{one}.json" for one in objects]
-        trackers = [
-            str(tracker) for file in files if (tracker := json.loads(file.read_text()).get("tracker"))
-        ]
-        cameras = cast(list[str], rig["cameras"])
-        return _Rig(str(rig.get("kind")), str(rig.get("hand")), cameras, imus, objects, trackers)
-    except (AttributeError, OSError, ValueError, RecursionError, KeyError, TypeError) as error:
-        raise DemoError(
-            f"{path}: cannot read the rig ({error}); give --calibration DIR and --rig NAME"
-        ) from error
+        return [str(tracker) for file in files if (tracker := json.loads(file.read_text()).get("tracker"))]
+    except (AttributeError, OSError, ValueError, RecursionError) as error:
+        raise DeployError(f"{calibration}: cannot read the objects of rig {rig.name!r} ({error})") from error
 
 
 _STALE = ("summary.json", "live.json", "poses.npz", "hand.png", "run.rrd", "object_*.npz", "contact_*.npz",
@@ -148,7 +124,6 @@ class DemoSettings:
         rigs: Rigs to simulate, which one master runs.
         scene: What moves, by the names of `common.sim.scenes`.
         web: The viewer is a page on 127.0.0.1 instead of a window.
-        master: Module that is run as the master.
         bus: Endpoint of the master's bus; None: encrypted, on a port that is free.
         console: The console, a page as well, takes the viewer's place.
     """
@@ -161,12 +136,11 @@ class DemoSettings:
     seed: int
     scene: str = "standard"
     web: bool = False
-    master: str = "master"
     bus: str | None = None
     console: bool = False
 
     def sensors(self) -> list[Sensor]:
-        """What is simulated. Raises DemoError: see `sensors_of`."""
+        """What is simulated; see `sensors_of`."""
         return sensors_of(self.calibration, self.rigs, self.scene)
 
 
@@ -180,6 +154,16 @@ class _State:
     viewer_ended: bool = False
     printed: set[str] = field(default_factory=set[str])
 
+    def on_line(self, name: str, line: str) -> None:
+        """Take a line of a process."""
+        if name == "master":
+            if line.endswith("tracking"):
+                self.tracking.set()
+            elif match := re.search(r"rate (\d+) poses/s", line):
+                self.rate = float(match[1])
+        elif name == "viewer" and line.startswith("master: ") and "waiting" not in line:
+            self.viewer = line.removeprefix("master: ")
+
 
 def run_demo(
     settings: DemoSettings, stop: threading.Event, notify: Callable[[str], None]
@@ -189,7 +173,7 @@ def run_demo(
     When `stop` is set, by Ctrl-C, the run ends early, cleanly, and is summed up all the same.
 
     Raises:
-        DemoError: A process does not come up, or the results cannot be made.
+        DeployError: A process does not come up, or the results cannot be made.
     """
     with demo_keys(settings) as keys:
         epoch_ns = time.monotonic_ns() + round(1e9 * lead_s(len(settings.sensors()) + 1, os.getloadavg()[0]))
@@ -203,18 +187,10 @@ def run_demo(
 
 @contextmanager
 def demo_keys(settings: DemoSettings) -> Generator[Path, None, None]:
-    """Provide a private keys folder for one run, gone at the end of the block.
-
-    Raises:
-        DemoError: It cannot be made.
-    """
+    """Provide a private keys folder for one run, gone at the end of the block."""
     with tempfile.TemporaryDirectory(prefix="phalanx-demo-") as private:
         folder = Path(private) / "keys"
-        names = [word for sensor in settings.sensors() for word in ("--device", sensor.name)]
-        command = [sys.executable, "-m", "master", "fleet", "keys", str(folder), "--make", *names]
-        made = subprocess.run(command, capture_output=True, text=True, check=False)
-        if made.returncode != 0:
-            raise DemoError(f"cannot make keys: {made.stderr.strip()}")
+        make_keys(folder, [sensor.name for sensor in settings.sensors()], lambda _line: None)
         yield folder
 
 
@@ -224,9 +200,8 @@ def lead_s(processes: int, load: float) -> float:
     # runs, and one in which cameras already look at the hand, which does not move yet, so that the light is known
     # and a hand found.
     # Poses before the scene are not judged. An IMU begins with it: its filter settles while the hand still rests.
-    ready_core_s, least_s, most_s = 2.0, 4.0, 20.0
-    ready = ready_core_s * (processes + load) / (os.cpu_count() or 1)
-    return min(max(ready + _KNOWN_S, least_s), most_s)
+    ready_s = 2.0 * (processes + load) / (os.cpu_count() or 1)
+    return min(max(ready_s + _KNOWN_S, 4.0), 20.0)
 
 
 def play(
@@ -238,13 +213,13 @@ def play(
     clock; `stop` ends the run early.
 
     Raises:
-        DemoError: A process does not come up.
+        DeployError: A process does not come up.
     """
     out = settings.out
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise DemoError(f"--out {out}: cannot make the folder: {error.strerror}") from error
+        raise DeployError(f"--out {out}: cannot make the folder: {error.strerror}") from error
     for stale in _STALE:
         for file in out.glob(stale):
             file.unlink()
@@ -254,7 +229,7 @@ def play(
         drawn = {sensor.name for sensor in settings.sensors() if sensor.kind == "camera"}
         for name, command, environment in _table(settings, keys, epoch_ns):
             nice = _GIVES_WAY if name in drawn else 0
-            processes.append(Process(name, command, environment, out / f"{name}.log", _listener(state), nice))
+            processes.append(Process(name, command, environment, out / f"{name}.log", state.on_line, nice))
         if settings.bus is not None and not settings.bus.startswith("tcp/"):
             notify(f"programs that read along at {settings.bus} need PHALANX_KEYS={keys}")
         notify(f"started {', '.join(f'{p.name} (pid {p.pid})' for p in processes)}; logs in {out}")
@@ -283,37 +258,35 @@ def _table(settings: DemoSettings, keys: Path, epoch_ns: int) -> list[tuple[str,
     beacon, data = _free_port(socket.SOCK_DGRAM), _free_port(socket.SOCK_DGRAM)
     bus = settings.bus or f"tls/127.0.0.1:{_free_port(socket.SOCK_STREAM)}"
     tree = ["--calibration", str(settings.calibration)]
-    place = [*rig_options(settings.rigs), *tree]
     rows: list[tuple[str, list[str], dict[str, str]]] = []
     link = ["--bind", "127.0.0.1", "--beacon-port", str(beacon)]
     played = ["--seed", str(settings.seed), "--scene-epoch-ns", str(epoch_ns)]
     for index, sensor in enumerate(settings.sensors()):
-        zero_ms = 1234.5
-        clock = ["--clock-offset-ms", str(zero_ms * (index + 1)), "--clock-ppm", str(_APART_PPM * index)]
-        start = ["--start-offset-ms", str(_LATE_MS * index - 1e3 * _KNOWN_S)]
-        who = ["--rig", sensor.rig, *tree, "--scene", sensor.scene]
         command = [
+            sys.executable,
+            "-m",
+            "slave",
             "run",
             f"--{sensor.kind}",
             "synthetic",
             "--name",
             sensor.name,
-            *who,
-            *played,
-            *clock,
-            *link,
         ]
-        command += start if sensor.kind == "camera" else []
-        rows.append((sensor.name, [sys.executable, "-m", "slave", *command], key))
+        command += ["--rig", sensor.rig, *tree, "--scene", sensor.scene, *played, *link]
+        command += ["--clock-offset-ms", str(1234.5 * (index + 1)), "--clock-ppm", str(_APART_PPM * index)]
+        if sensor.kind == "camera":
+            command += ["--start-offset-ms", str(_LATE_MS * index - 1e3 * _KNOWN_S)]
+        rows.append((sensor.name, command, key))
     files = ["--poses", str(settings.out / "poses.npz"), "--summary", str(settings.out / "live.json")]
-    address = ["--beacon", f"127.255.255.255:{beacon}", "--bind", f"127.0.0.1:{data}", "--bus", bus]
-    rows.append(("master", [sys.executable, "-m", settings.master, "run", *place, *address, *files], key))
-    if settings.console:
-        page = ["--port", "0"]
-        rows.append(("viewer", [sys.executable, "-m", "master", "console", *place, "--bus", bus, *page], key))
-    elif not settings.headless:
-        page = ["--web", "--web-port", str(_free_port(socket.SOCK_STREAM))] if settings.web else []
-        rows.append(("viewer", [sys.executable, "-m", "master", "view", *place, "--bus", bus, *page], key))
+    address = ["--beacon", f"127.255.255.255:{beacon}", "--bind", f"127.0.0.1:{data}"]
+    shared = [*rig_options(settings.rigs), *tree, "--bus", bus]
+    rows.append(("master", [sys.executable, "-m", "master", "run", *shared, *address, *files], key))
+    if settings.console or not settings.headless:
+        page = ["--port", "0"] if settings.console else []
+        if settings.web and not settings.console:
+            page = ["--web", "--web-port", str(_free_port(socket.SOCK_STREAM))]
+        viewer = "console" if settings.console else "view"
+        rows.append(("viewer", [sys.executable, "-m", "master", viewer, *shared, *page], key))
     return rows
 
 
@@ -321,19 +294,6 @@ def _free_port(kind: int) -> int:
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
-
-
-def _listener(state: _State) -> Callable[[str, str], None]:
-    def on_line(name: str, line: str) -> None:
-        if name == "master":
-            if line.endswith("tracking"):
-                state.tracking.set()
-            elif match := re.search(r"rate (\d+) poses/s", line):
-                state.rate = float(match[1])
-        elif name == "viewer" and line.startswith("master: ") and "waiting" not in line:
-            state.viewer = line.removeprefix("master: ")
-
-    return on_line
 
 
 def _wait_until_tracking(
@@ -350,7 +310,7 @@ def _wait_until_tracking(
         if failed is not None or time.monotonic() > deadline:
             late = failed or next(p for p in processes if p.name == "master")
             what = "ended" if failed else f"no pose after {ready_s:.0f} s"
-            raise DemoError(f"{late.name}: {what}; its last lines:\n  " + "\n  ".join(late.tail))
+            raise DeployError(f"{late.name}: {what}; its last lines:\n  " + "\n  ".join(late.tail))
 
 
 def _look_at_viewer(state: _State, processes: list[Process], notify: Callable[[str], None]) -> None:
@@ -401,7 +361,7 @@ def _report(settings: DemoSettings, epoch_ns: int, notify: Callable[[str], None]
     if not (out / "live.json").exists():
         log = out / "master.log"
         last = (log.read_text(errors="replace").splitlines() or ["nothing"])[-1].partition(" ")[2]
-        raise DemoError(f"the master wrote no summary; its last line in {log}: {last}")
+        raise DeployError(f"the master wrote no summary; its last line in {log}: {last}")
     notify("comparing with the exact truth, drawing the hand ...")
     scene = ["--scene", settings.scene, "--seed", str(settings.seed)]
     place = [*rig_options(settings.rigs), "--calibration", str(settings.calibration), *scene]
@@ -411,7 +371,7 @@ def _report(settings: DemoSettings, epoch_ns: int, notify: Callable[[str], None]
     # A session of its own: the first Ctrl-C must not reach the report; the second ends it through `run`.
     done = subprocess.run(command, env=dict(os.environ), start_new_session=True, check=False)
     if done.returncode != 0:
-        raise DemoError("the report failed, see above")
+        raise DeployError("the report failed, see above")
     return cast(dict[str, object], json.loads((out / "summary.json").read_text()))
 
 

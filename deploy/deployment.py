@@ -24,8 +24,11 @@ WAIT_SENDERS_S = 12.0
 LEAST_S = 4.0  # a master reports its counts once a second, a beacon comes as often
 
 
+Notify = Callable[[str], None]
+
+
 @dataclass(frozen=True, slots=True)
-class Ears:
+class ListenOptions:
     """How datagrams are received, for how long; options of `fleet status --wait`."""
 
     options: tuple[str, ...]
@@ -48,14 +51,17 @@ class Received:
     master: bool = False
 
 
-def received_of(names: Sequence[str], ears: Ears, ended: threading.Event | None = None) -> Received:
+def received_of(
+    names: Sequence[str], listening: ListenOptions, ended: threading.Event | None = None
+) -> Received:
     """Return which senders `fleet status --wait` receives, until `ended` is set."""
-    words = [sys.executable, "-m", "master", "fleet", "status", "--json", "--seconds", str(ears.seconds)]
-    words += [*ears.options, *(word for name in names for word in ("--wait", name))]
+    words = [sys.executable, "-m", "master", "fleet", "status", "--json"]
+    words += ["--seconds", str(listening.seconds), *listening.options]
+    words += [word for name in names for word in ("--wait", name)]
     lines: list[str] = []
-    environment = {"PHALANX_KEYS": str(ears.keys)}
-    end_s = 60.0  # of the program that listens, besides what it listens
-    code, errors = run_bounded(words, b"", lines.append, ears.seconds + end_s, environment, ended)
+    environment = {"PHALANX_KEYS": str(listening.keys)}
+    limit_s = listening.seconds + 60.0  # the program that listens has to start and end, too
+    code, errors = run_bounded(words, b"", lines.append, limit_s, environment, ended)
     results = [line for line in lines if line.startswith('{"heard"')]
     if not results:
         lines = [*lines, *errors] or [f"phalanx fleet status --wait ended with {code}"]
@@ -68,11 +74,11 @@ def received_of(names: Sequence[str], ears: Ears, ended: threading.Event | None 
 class Before:
     """Senders received before anything is changed; holds the thread that listens."""
 
-    def __init__(self, names: Sequence[str], ears: Ears) -> None:
-        """Begin to listen."""
-        self._names, self._ears = tuple(names), ears
+    def __init__(self, names: Sequence[str], listening: ListenOptions) -> None:
+        """Begin to listen, until `ended` is set."""
+        self._names, self._listening = tuple(names), listening
         self._received, self._took_s = Received(), 0.0
-        self._ended = threading.Event()
+        self.ended = threading.Event()
         self._thread = threading.Thread(target=self._listen, daemon=True)
         self._thread.start()
 
@@ -82,27 +88,21 @@ class Before:
         self._thread.join()
         return self._received.master
 
-    def ears(self, start_s: float | None) -> Ears:
+    def listening(self, start_s: float | None) -> ListenOptions:
         """How to listen for one machine afterwards.
 
         `start_s` is how long its slaves took to start before [s]; None: they did not run.
         """
         self._thread.join()
         if start_s is None or not self._received.master or set(self._received.rates) < set(self._names):
-            return self._ears
-        times = 2.0
-        seconds = max(LEAST_S, times * self._took_s, times * start_s)
-        return replace(self._ears, seconds=min(self._ears.seconds, seconds))
-
-    def end(self) -> None:
-        """Listen no longer."""
-        self._ended.set()
+            return self._listening
+        seconds = max(LEAST_S, 2.0 * self._took_s, 2.0 * start_s)
+        return replace(self._listening, seconds=min(self._listening.seconds, seconds))
 
     def _listen(self) -> None:
         began = time.monotonic()
-        before_s = 5.0
-        ears = replace(self._ears, seconds=min(before_s, self._ears.seconds))
-        self._received = received_of(self._names, ears, self._ended)
+        listening = replace(self._listening, seconds=min(5.0, self._listening.seconds))
+        self._received = received_of(self._names, listening, self.ended)
         self._took_s = time.monotonic() - began
 
 
@@ -111,7 +111,7 @@ _PICAMERA2 = "picamera2"  # the default of cameras
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class DeployRequest:
     """What the user wants on all machines.
 
     Attributes:
@@ -143,8 +143,8 @@ class Wish:
         """
         drivers: list[str] = []
         for name in [one for one in names if one in self.rig.cameras]:
-            pairs_of = [one.partition("=") for one in self.cameras]
-            own = [driver if whose == name else whose + sign + driver for whose, sign, driver in pairs_of
+            given = [(one.partition("="), one) for one in self.cameras]
+            own = [driver if whose == name else text for (whose, _, driver), text in given
                    if whose == name or whose not in self.rig.names]  # fmt: skip
             drivers.append(own[-1] if own else _PICAMERA2)
         return next((one for one in drivers if one.startswith(_PICAMERA2)), (drivers or [""])[0])
@@ -171,54 +171,44 @@ class Host:
     start_s: float | None = None
     known: dict[str, str] = field(default_factory=dict[str, str])
 
-    def deploy(self, wish: Wish) -> None:
-        """Bring it to what is wanted.
-
-        Raises:
-            DeployError: It failed; the machine is as before.
-        """
-        camera = wish.driver(self.target.names)
+    def deploy(self, request: DeployRequest) -> None:
+        """Bring it to what is requested, or `DeployError`: it is as before."""
+        camera = request.driver(self.target.names)
         picamera2 = camera.startswith(_PICAMERA2)
-        facts = self.look(camera, wish.apt)
-        self._packages(facts, wish, picamera2)
+        facts = self.look(camera, request.apt)
+        self._packages(facts, request, picamera2)
         old = facts["codename"] == "bookworm"  # whose simplejpeg was built for numpy 1
         kind = Kind(
             str(facts["machine"]),
             ".".join(str(part) for part in cast(list[int], facts["python"])),
             ("simplejpeg",) if picamera2 and old else (),
-            ("wrist",) if wish.rig.kind == "wrist" else (),
+            ("wrist",) if request.rig.kind == "wrist" else (),
         )
-        wheels = wheelhouse(kind, wish.wheels, self.notify)
-        there = wheels.release in cast(list[str], facts["releases"])
+        wheels = wheelhouse(kind, request.wheels, self.notify)
         stage = f"{STAGE}/{wheels.release}"
-        if not there:
-            self.notify(f"{'would send' if wish.dry_run else 'sending'} {wheels.size_mb:.0f} MB of wheels")
-        if not there and not wish.dry_run:
-            self.remote.send(wheels.files, stage, self.sudo)
-        words = ["install", "--json", "--bundle", BUNDLE, "--master", wish.master, "--rig", wish.rig.name]
-        words += ["--release", wheels.release, "--wheelhouse", stage]
-        words += ["--ready-s", str(wish.ready_s), *wish.options]
+        if wheels.release not in cast(list[str], facts["releases"]):
+            self.notify(f"{'would send' if request.dry_run else 'sending'} {wheels.size_mb:.0f} MB of wheels")
+            if not request.dry_run:
+                self.remote.send(wheels.files, stage, self.sudo)
+        words = ["install", "--json", "--bundle", BUNDLE, "--master", request.master]
+        words += ["--rig", request.rig.name, "--release", wheels.release, "--wheelhouse", stage]
+        words += ["--ready-s", str(request.ready_s), *request.options]
         words += [word for name in self.target.names for word in ("--name", name)]
-        words += ["--dry-run"] if wish.dry_run else []
-        packed = bundle(wish.keys, self.target.names, wish.calibration, wish.rig)
+        words += ["--dry-run"] if request.dry_run else []
+        packed = bundle(request.keys, self.target.names, request.calibration, request.rig)
         done = self._act(words, packed)
         self.changed = bool(done.get("changed")) or bool(done.get("restarted"))
         self.reboot = bool(done.get("reboot"))
         self.notify(str(done["text"]))
 
     def look(self, camera: str = "", apt: bool = True) -> dict[str, object]:
-        """What it is like.
-
-        Raises:
-            DeployError: It is not reached, or nothing can be installed there.
-        """
+        """What it is like; DeployError: not reached, or nothing can be installed there."""
         lines: list[tuple[float, str]] = []
-        probe_s = 60.0
         code = self.remote.run(
             command(["probe", camera, *([] if apt else ["--no-apt"])], sudo=False),
-            _plain_bundle(),
+            bundle(),
             lambda line: lines.append((time.time(), line)),
-            probe_s,
+            60.0,
         )
         results = [(at, found) for at, line in lines if (found := _result(line)) is not None]
         if code != 0 or not results:
@@ -234,43 +224,35 @@ class Host:
         python = ".".join(str(part) for part in cast(list[int], facts["python"]))
         self.notify(f"{facts['model']}, {facts['os']}, {facts['machine']}, Python {python}")
         ahead_s = cast(int, facts["t_unix_ns"]) * 1e-9 - arrived
-        clock_s = 0.5  # from here on it is reported
-        if abs(ahead_s) > clock_s:
+        if abs(ahead_s) > 0.5:
             self.notify(
                 f"its clock is {ahead_s:+.1f} s from this one; chrony brings it here, if this machine answers"
             )
         return facts
 
     def roll_back(self, dry_run: bool = False) -> str:
-        """Let it go back to what was before; the text of what is there now.
+        """Go back to what was before; what is there now, or DeployError: it does not run."""
+        return self._end("--rollback", dry_run)
 
-        Raises:
-            DeployError: There was nothing before, or it does not run.
-        """
-        words = ["install", "--json", "--rollback", *(["--dry-run"] if dry_run else [])]
-        return str(self._act(words, _plain_bundle())["text"])
+    def uninstall(self, dry_run: bool) -> str:
+        """Take everything of ours away; what that was, or DeployError."""
+        return self._end("--uninstall", dry_run)
 
-    def uninstall(self, dry_run: bool) -> None:
-        """Take everything of ours away.
+    def _end(self, option: str, dry_run: bool) -> str:
+        words = ["install", "--json", option, *(["--dry-run"] if dry_run else [])]
+        return str(self._act(words, bundle())["text"])
 
-        Raises:
-            DeployError: It failed.
-        """
-        self.look()
-        words = ["install", "--json", "--uninstall", *(["--dry-run"] if dry_run else [])]
-        self.notify(str(self._act(words, _plain_bundle())["text"]))
-
-    def _packages(self, facts: dict[str, object], wish: Wish, picamera2: bool) -> None:
+    def _packages(self, facts: dict[str, object], request: DeployRequest, picamera2: bool) -> None:
         """Install the packages that the system lacks, or report what it lacks."""
         there = cast(list[str], facts["packages"])
         wanted = ["rsync", "chrony", *(["python3-picamera2"] if picamera2 else [])]
         missing = [name for name in wanted if name not in there]
         if not missing:
             return
-        if wish.apt and not wish.dry_run:
-            self._act(["packages", *missing], _plain_bundle())
-            return
-        self.notify(f"{'would install' if wish.apt else 'not installed'}: {' '.join(missing)}")
+        if request.apt and not request.dry_run:
+            self._act(["packages", *missing], bundle())
+        else:
+            self.notify(f"{'would install' if request.apt else 'not installed'}: {' '.join(missing)}")
 
     def _act(self, words: Sequence[str], packed: bytes) -> dict[str, object]:
         """Run the installer there and return its result; DeployError: why it failed."""
@@ -303,28 +285,16 @@ def _result(line: str) -> dict[str, object] | None:
         return None
 
 
-def _plain_bundle() -> bytes:
-    """The installer alone."""
-    return bundle(None, (), None, None)
-
-
-Notify = Callable[[str], None]
-
-
 @dataclass(frozen=True, slots=True)
-class Reached:
-    """How machines are reached: options of ssh, by when all of one machine is done."""
+class SshOptions:
+    """How machines are reached, and by when all of one machine is done."""
 
-    options: tuple[str, ...]
+    words: tuple[str, ...]
     deadline_s: float
 
 
 def make_keys(folder: Path, names: Sequence[str], notify: Notify) -> None:
-    """Make the missing keys of a folder, by `phalanx fleet keys --make`.
-
-    Raises:
-        DeployError: They cannot be made.
-    """
+    """Make missing keys of a folder, by `phalanx fleet keys --make`; or DeployError."""
     wanted = [folder / one for one in ("rig.key", "devices.key", "ca.pem")]
     wanted += [folder / f"devices/{name}.{kind}" for name in names for kind in ("pem", "secret")]
     if all(path.is_file() for path in wanted):
@@ -333,63 +303,60 @@ def make_keys(folder: Path, names: Sequence[str], notify: Notify) -> None:
     devices = [word for name in names for word in ("--device", name)]
     words = [sys.executable, "-m", "master", "fleet", "keys", str(folder), "--make", *devices]
     lines: list[str] = []
-    keys_s = 60.0
-    code, errors = run_bounded(words, b"", lines.append, keys_s)
+    code, errors = run_bounded(words, b"", lines.append, 60.0)
     if code != 0:
         raise DeployError(f"keys: {([*lines, *errors] or ['phalanx fleet keys --make has no end'])[-1]}")
 
 
 def deploy(
-    targets: Sequence[Target], wish: Wish, reached: Reached, ears: Ears | None, notify: Notify
+    targets: Sequence[Target],
+    request: DeployRequest,
+    ssh: SshOptions,
+    listening: ListenOptions | None,
+    notify: Notify,
 ) -> dict[str, str | None]:
     """Deploy to all at once; host -> None, or one line why it failed there.
 
-    `ears` is how first datagrams are received; None: nobody listens.
+    `listening` is how first datagrams are received; None: nobody listens.
     """
-    hosts = _hosts(targets, reached, notify)
-    if ears is None or wish.dry_run:
-        return _each(hosts, lambda host: host.deploy(wish))
-    before = Before([name for target in targets for name in target.names], ears)
+    hosts = _hosts(targets, ssh, notify)
+    if listening is None or request.dry_run:
+        return _each(hosts, lambda host: host.deploy(request))
+    before = Before([name for target in targets for name in target.names], listening)
 
     def one(host: Host) -> None:
-        host.deploy(wish)
+        host.deploy(request)
         if not host.reboot and before.at_master:  # at once: others may take longer, and it may be silent
-            _wait_received(host, before.ears(host.start_s))
+            own = before.listening(host.start_s)
+            _judge(host, _received([host], own, host.remote.deadline.ended), own)
 
     try:
         failed = _each(hosts, one)
     finally:
-        before.end()
+        before.ended.set()
     there = [host for host in hosts if failed[host.target.host] is None and not host.reboot]
     if there and not before.at_master:  # then all are listened for together: one port, one start
-        failed |= _wait_for_senders(there, ears)
+        failed |= _wait_for_senders(there, listening)
     return failed
 
 
-def uninstall(
-    targets: Sequence[Target], reached: Reached, dry_run: bool, notify: Notify
+def end_all(
+    targets: Sequence[Target], ssh: SshOptions, act: Callable[[Host], str], notify: Notify
 ) -> dict[str, str | None]:
-    """Remove this project from all machines; host -> None, or why it failed there."""
-    return _each(_hosts(targets, reached, notify), lambda host: host.uninstall(dry_run))
-
-
-def roll_back(
-    targets: Sequence[Target], reached: Reached, dry_run: bool, notify: Notify
-) -> dict[str, str | None]:
-    """Roll all machines back; host -> None, or one line why it failed there."""
+    """Roll back or remove (`act`) on all machines; host -> None, or why it failed."""
 
     def one(host: Host) -> None:
         host.look()
-        host.notify(host.roll_back(dry_run))
+        host.notify(act(host))
 
-    return _each(_hosts(targets, reached, notify), one)
+    return _each(_hosts(targets, ssh, notify), one)
 
 
-def _hosts(targets: Sequence[Target], reached: Reached, notify: Notify) -> list[Host]:
+def _hosts(targets: Sequence[Target], ssh: SshOptions, notify: Notify) -> list[Host]:
     known: dict[str, str] = {}
 
     def host(target: Target) -> Host:
-        remote = Remote(target.host, reached.options, Deadline(reached.deadline_s))
+        remote = Remote(target.host, ssh.words, Deadline(ssh.deadline_s))
         return Host(target, remote, lambda line: notify(f"{target.host}: {line}"), known=known)
 
     return [host(target) for target in targets]
@@ -411,32 +378,32 @@ def _each(hosts: Sequence[Host], act: Callable[[Host], None]) -> dict[str, str |
             results = list(waiting)
         except KeyboardInterrupt:  # each ends its ssh; what runs on a machine goes on to its end there
             for host in hosts:
-                host.remote.deadline.end()
+                host.remote.deadline.ended.set()
             raise
     return {host.target.host: result for host, result in zip(hosts, results, strict=True)}
 
 
-def _wait_for_senders(hosts: Sequence[Host], ears: Ears) -> dict[str, str | None]:
+def _wait_for_senders(hosts: Sequence[Host], listening: ListenOptions) -> dict[str, str | None]:
     """Wait until each sender was received, and roll back machines that are silent."""
+    received = _received(hosts, listening)
+    return _each(hosts, lambda host: _judge(host, received, listening))
+
+
+def _received(
+    hosts: Sequence[Host], listening: ListenOptions, ended: threading.Event | None = None
+) -> Received:
     for host in hosts:
         host.notify("waiting for its first datagram")
-    received = received_of([name for host in hosts for name in host.target.names], ears)
-    return _each(hosts, lambda host: _judge(host, received, ears))
+    return received_of([name for host in hosts for name in host.target.names], listening, ended)
 
 
-def _wait_received(host: Host, ears: Ears) -> None:
-    """The same for one machine."""
-    host.notify("waiting for its first datagram")
-    _judge(host, received_of(host.target.names, ears, host.remote.deadline.ended), ears)
-
-
-def _judge(host: Host, received: Received, ears: Ears) -> None:
+def _judge(host: Host, received: Received, listening: ListenOptions) -> None:
     """Roll back a machine one of whose senders is silent, and raise DeployError."""
     missing = [name for name in host.target.names if name not in received.rates]
     if not missing:
         host.notify(f"streams: {', '.join(f'{n} {received.rates[n]:.0f}/s' for n in host.target.names)}")
         return
-    why = received.cause or f"no datagram of {', '.join(missing)} in {ears.seconds:.0f} s at the master"
+    why = received.cause or f"no datagram of {', '.join(missing)} in {listening.seconds:.0f} s at the master"
     if received.cause is not None or not host.changed:
         raise DeployError(why)
     try:
@@ -446,25 +413,12 @@ def _judge(host: Host, received: Received, ears: Ears) -> None:
     raise DeployError(f"{why}; {back}")
 
 
-class Lines:
-    """Lines of several threads, one after the other. Holds the lock."""
+def line_writer(write: Notify) -> Notify:
+    """What writes the lines of several threads one after the other, and printable."""
+    lock = threading.Lock()
 
-    def __init__(self, write: Notify) -> None:
-        """To `write`."""
-        self._write, self._lock = write, threading.Lock()
+    def notify(line: str) -> None:
+        with lock:
+            write(printable(line))
 
-    def __call__(self, line: str) -> None:
-        """Write one."""
-        with self._lock:
-            self._write(printable(line))
-
-
-def reach_of(
-    user: str | None, port: int | None, identity: Path | None, more: Sequence[str]
-) -> tuple[str, ...]:
-    """Options of ssh."""
-    words: list[str] = []
-    words += ["-l", user] if user else []
-    words += ["-p", str(port)] if port else []
-    words += ["-i", str(identity)] if identity else []
-    return (*words, *(word for option in more for word in ("-o", option)))
+    return notify

@@ -17,7 +17,7 @@ import sys
 import threading
 import zipfile
 from base64 import urlsafe_b64encode
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
@@ -43,13 +43,16 @@ def command(arguments: Sequence[str], sudo: bool) -> list[str]:
     return [*(["sudo", "-n"] if sudo else []), "python3", "-c", _BOOT, *arguments]
 
 
-def bundle(keys: Path | None, names: Sequence[str], calibration: Path | None, rig: RigFile | None) -> bytes:
-    """Return the zip, with only the keys and files that the machine needs.
-
-    Raises:
-        DeployError: A file is missing.
-    """
-    files = {path.relative_to(ROOT).as_posix(): path for path in _installer()}
+def bundle(
+    keys: Path | None = None,
+    names: Sequence[str] = (),
+    calibration: Path | None = None,
+    rig: RigFile | None = None,
+) -> bytes:
+    """The zip: installer, keys and files that the machine needs; or DeployError."""
+    package = ROOT / "slave" / "install"
+    installer = [ROOT / "slave" / "__init__.py", *package.glob("*.py"), *(package / "files").glob("*")]
+    files = {path.relative_to(ROOT).as_posix(): path for path in installer}
     if keys is not None:
         own = ["rig.key", "ca.pem", *(f"devices/{name}.{kind}" for name in names for kind in _OWN)]
         files |= {KEYS + name: keys / name for name in own}
@@ -63,11 +66,6 @@ def bundle(keys: Path | None, names: Sequence[str], calibration: Path | None, ri
             except OSError as error:
                 raise DeployError(f"{path}: {error.strerror}; it has to go to the machine") from error
     return packed.getvalue()
-
-
-def _installer() -> list[Path]:
-    package = ROOT / "slave" / "install"
-    return [ROOT / "slave" / "__init__.py", *package.glob("*.py"), *(package / "files").glob("*")]
 
 
 NAME = "phalanx-hand"
@@ -113,44 +111,31 @@ class Wheels:
 
 
 def wheelhouse(kind: Kind, given: Path | None, notify: Callable[[str], None]) -> Wheels:
-    """Return the wheels for machines of this kind.
+    """The wheels for machines of this kind, or DeployError.
 
     `given` is a folder that the user made; ours is added if it is missing there. None: they are downloaded.
-
-    Raises:
-        DeployError: A wheel cannot be had.
     """
     try:
-        return _gathered(kind, given, notify)
+        with _LOCK:  # the second machine of a kind waits for the first
+            folder = _downloaded(kind, notify) if given is None else given
+            files = sorted(folder.glob("*.whl"))
+            if not files:
+                raise DeployError(f"--wheelhouse {given}: no wheels in it")
+            if given is not None and (wrong := [one.name for one in files if not fits(one.name, kind)]):
+                raise DeployError(
+                    f"--wheelhouse {given}: {wrong[0]} is not for {kind.machine} with Python {kind.python}; "
+                    f"those that are: phalanx fleet wheels DIR --machine {kind.machine} --python {kind.python}"
+                )
+            if not any(file.name.startswith("phalanx_hand-") for file in files):
+                files.append(own_wheel())
+            files.sort(key=lambda file: file.name)  # as the installer there names it, too
+            digest = hashlib.sha256()
+            for file in files:
+                digest.update(file.name.encode() + hashlib.sha256(file.read_bytes()).digest())
     except OSError as error:
         raise DeployError(f"wheels: {error.filename or cache()}: {error.strerror or error}") from error
-
-
-def _gathered(kind: Kind, given: Path | None, notify: Callable[[str], None]) -> Wheels:
-    with _LOCK:  # the second machine of a kind waits for the first
-        folder = _downloaded(kind, notify) if given is None else given
-        files = sorted(folder.glob("*.whl"))
-        if not files:
-            raise DeployError(f"--wheelhouse {given}: no wheels in it")
-        _check_given(files, kind, given)
-        if not any(file.name.startswith("phalanx_hand-") for file in files):
-            files.append(own_wheel())
-        files.sort(key=lambda file: file.name)  # as the installer there names it, too
-        digest = hashlib.sha256()
-        for file in files:
-            digest.update(file.name.encode() + hashlib.sha256(file.read_bytes()).digest())
-        versions = [file.name.split("-")[1] for file in files if file.name.startswith("phalanx_hand-")]
-        return Wheels(tuple(files), f"{versions[-1]}-{digest.hexdigest()[:8]}")
-
-
-def _check_given(files: Iterable[Path], kind: Kind, given: Path | None) -> None:
-    """Refuse wheels of another kind of machine here, where it costs nothing."""
-    for file in files if given is not None else ():
-        if not fits(file.name, kind):
-            raise DeployError(
-                f"--wheelhouse {given}: {file.name} is not for {kind.machine} with Python {kind.python}; "
-                f"those that are: phalanx fleet wheels DIR --machine {kind.machine} --python {kind.python}"
-            )
+    versions = [file.name.split("-")[1] for file in files if file.name.startswith("phalanx_hand-")]
+    return Wheels(tuple(files), f"{versions[-1]}-{digest.hexdigest()[:8]}")
 
 
 def fits(wheel: str, kind: Kind) -> bool:
@@ -172,11 +157,7 @@ def fits(wheel: str, kind: Kind) -> bool:
 
 
 def export(kind: Kind, folder: Path, notify: Callable[[str], None]) -> Wheels:
-    """Put the wheels for machines of this kind, that have no network, into a folder.
-
-    Raises:
-        DeployError: A wheel cannot be had, or the folder has others already.
-    """
+    """Put the wheels for machines without network into a new folder, or DeployError."""
     if folder.exists() and any(folder.iterdir()):
         raise DeployError(f"{folder}: is not empty")
     wheels = wheelhouse(kind, None, notify)
@@ -187,22 +168,25 @@ def export(kind: Kind, folder: Path, notify: Callable[[str], None]) -> Wheels:
 
 
 def own_wheel() -> Path:
-    """Make the wheel of this program as it is, without a network or a build.
-
-    Raises:
-        DeployError: It was never installed, so that nobody knows what it needs.
-    """
+    """Make the wheel of this program as it is, without a network or a build."""
     ours = _ours()
     stem = f"{NAME.replace('-', '_')}-{ours.version}"
     info = f"{stem}.dist-info"
-    files = {path.relative_to(ROOT).as_posix(): path.read_bytes() for path in _sources()}
-    files |= {
-        f"{info}/{name}": (ours.read_text(name) or "").encode() for name in ("METADATA", "entry_points.txt")
+    sources = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*"))]
+    files = {
+        path.relative_to(ROOT).as_posix(): path.read_bytes()
+        for path in sources
+        if path.is_file() and "__pycache__" not in path.parts
     }
+    for name in ("METADATA", "entry_points.txt"):
+        files[f"{info}/{name}"] = (ours.read_text(name) or "").encode()
     files[f"{info}/WHEEL"] = (
         b"Wheel-Version: 1.0\nGenerator: phalanx\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
     )
-    rows = [f"{name},sha256={_digest(content)},{len(content)}" for name, content in files.items()]
+    rows: list[str] = []
+    for name, content in files.items():
+        digest = urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
+        rows.append(f"{name},sha256={digest},{len(content)}")
     files[f"{info}/RECORD"] = "\n".join([*rows, f"{info}/RECORD,,", ""]).encode()
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
@@ -218,13 +202,6 @@ def own_wheel() -> Path:
     return wheel
 
 
-def _sources() -> Iterable[Path]:
-    for package in PACKAGES:
-        for path in sorted((ROOT / package).rglob("*")):
-            if path.is_file() and "__pycache__" not in path.parts:
-                yield path
-
-
 def _ours() -> Distribution:
     try:
         return distribution(NAME)
@@ -234,13 +211,10 @@ def _ours() -> Distribution:
         ) from error
 
 
-def _digest(content: bytes) -> str:
-    return urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
-
-
 def _downloaded(kind: Kind, notify: Callable[[str], None]) -> Path:
     requirements = [*_requirements(kind.extras), *kind.more, "pip"]
-    limits = _limits()
+    places = (ROOT / "deploy" / "constraints.txt", ROOT / "constraints.txt")
+    limits = next((path for path in places if path.is_file()), None)  # tested versions, where they are known
     key = "\n".join([*requirements, *([] if limits is None else [limits.read_text()])])
     digest = hashlib.sha256(key.encode()).hexdigest()[:12]
     folder = cache() / f"{kind.machine}-{kind.python}-{digest}"
@@ -264,15 +238,8 @@ def _download(kind: Kind, requirements: list[str], limits: Path | None, folder: 
     platforms = [f"manylinux_{glibc}_{kind.machine}" for glibc in reversed(_GLIBC)]
     platforms += [f"manylinux2014_{kind.machine}"]
     words = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check"]
-    words += [
-        "--dest",
-        str(folder),
-        "--only-binary=:all:",
-        "--implementation",
-        "cp",
-        "--python-version",
-        kind.python,
-    ]
+    words += [f"--dest={folder}", "--only-binary=:all:", "--implementation=cp"]
+    words += [f"--python-version={kind.python}"]
     words += [word for platform in platforms for word in ("--platform", platform)]
     words += ["-c", str(limits)] if limits is not None else []
     download_s = 600.0
@@ -283,12 +250,9 @@ def _download(kind: Kind, requirements: list[str], limits: Path | None, folder: 
     except subprocess.TimeoutExpired as error:
         raise DeployError(f"pip download: no end after {download_s:.0f} s; is there a network?") from error
     if done.returncode != 0:
-        errors = [line for line in done.stderr.splitlines() if line.startswith("ERROR:")] or [
-            done.stderr[-300:].strip()
-        ]
-        raise DeployError(
-            f"pip download: {errors[-1].removeprefix('ERROR: ')}; --wheelhouse DIR takes wheels you have"
-        )
+        errors = [line for line in done.stderr.splitlines() if line.startswith("ERROR:")]
+        why = errors[-1].removeprefix("ERROR: ") if errors else done.stderr[-300:].strip()
+        raise DeployError(f"pip download: {why}; --wheelhouse DIR takes wheels you have")
 
 
 def _requirements(extras: tuple[str, ...]) -> list[str]:
@@ -297,14 +261,6 @@ def _requirements(extras: tuple[str, ...]) -> list[str]:
     for line in _ours().requires or []:
         requirement, _, marker = (part.strip() for part in line.partition(";"))
         extra = re.search(r"extra == ['\"]([^'\"]+)", marker)
-        if extra is None or extra.group(1) in extras:
+        if extra is None or extra[1] in extras:
             found.append(requirement)
     return found
-
-
-def _limits() -> Path | None:
-    """The tested versions, where they are known."""
-    for path in (ROOT / "deploy" / "constraints.txt", ROOT / "constraints.txt"):
-        if path.is_file():
-            return path
-    return None

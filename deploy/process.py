@@ -39,8 +39,7 @@ class Process:
         """
         self.name = name
         self.restarts = 0
-        tail = 12
-        self.tail: deque[str] = deque(maxlen=tail)
+        self.tail: deque[str] = deque(maxlen=12)
         self._command, self._environment = list(command), {**os.environ, **environment}
         self._on_line, self._nice = on_line, nice
         self._log: IO[str] = log.open("w", buffering=1)

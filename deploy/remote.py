@@ -6,6 +6,7 @@ to an end, also when the network goes meanwhile.
 
 import contextlib
 import json
+import math
 import os
 import re
 import shlex
@@ -22,7 +23,7 @@ _HOST = re.compile(r"(?:[A-Za-z0-9._-]+@)?[A-Za-z0-9.:-]+")
 
 
 class DeployError(Exception):
-    """A deployment that is not possible; one line why, and what to do."""
+    """A demo or deployment that is not possible; one line why, and what to do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,14 +40,23 @@ class RigFile:
 
     name: str
     kind: str
+    hand: str
     cameras: tuple[str, ...]
     imu: str | None
-    files: tuple[str, ...]  # below calib_json, of this rig
+    imu_placed: bool  # whether its orientations on the palm and to the world are known
+    objects: tuple[str, ...]
 
     @property
     def names(self) -> tuple[str, ...]:
         """All that send."""
         return self.cameras + (() if self.imu is None else (self.imu,))
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Its files below calib_json."""
+        cameras = [f"cameras/{one}.json" for one in self.cameras]
+        objects = [f"objects/{one}.json" for one in self.objects]
+        return (f"rigs/{self.name}.json", *cameras, f"hands/{self.hand}.json", *objects)
 
 
 def read_rig(calibration: Path, name: str) -> RigFile:
@@ -59,15 +69,11 @@ def read_rig(calibration: Path, name: str) -> RigFile:
     try:
         rig = cast(dict[str, object], json.loads(path.read_text()))
         cameras = tuple(str(one) for one in cast(list[object], rig["cameras"]))
-        imu = cast(dict[str, object] | None, rig.get("imu"))
-        objects = cast(list[object], rig.get("objects") or [])
-        files = [
-            f"rigs/{name}.json",
-            *(f"cameras/{one}.json" for one in cameras),
-            f"hands/{rig['hand']}.json",
-        ]
-        files += [f"objects/{one}.json" for one in objects]
-        return RigFile(name, str(rig["kind"]), cameras, str(imu["name"]) if imu else None, tuple(files))
+        objects = tuple(str(one) for one in cast(list[object], rig.get("objects") or []))
+        imu = cast(dict[str, object], rig.get("imu") or {})
+        imu_name = str(imu.get("name", "imu")) if imu else None
+        placed = imu.get("q_palm_imu") is not None and imu.get("q_rig_world") is not None
+        return RigFile(name, str(rig["kind"]), str(rig["hand"]), cameras, imu_name, placed, objects)
     except (OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
         raise DeployError(
             f"{path}: cannot read the rig ({error}); give --calibration DIR and --rig NAME"
@@ -111,14 +117,8 @@ def targets_of(hosts: Sequence[str], rig: RigFile) -> list[Target]:
     return targets
 
 
-CONNECT_S = 10
-ALIVE_S, ALIVE_TIMES = 3, 3  # a link that is gone shows after nine seconds
-_SETTINGS = (
-    "BatchMode=yes",
-    f"ConnectTimeout={CONNECT_S}",
-    f"ServerAliveInterval={ALIVE_S}",
-    f"ServerAliveCountMax={ALIVE_TIMES}",
-)
+# A link that is gone shows after nine seconds
+_SETTINGS = ("BatchMode=yes", "ConnectTimeout=10", "ServerAliveInterval=3", "ServerAliveCountMax=3")
 _HINTS = (  # the first that is found: a changed host key is reported with two of them
     (
         "Could not resolve hostname",
@@ -144,23 +144,15 @@ _HINTS = (  # the first that is found: a changed host key is reported with two o
 
 
 class Deadline:
-    """Time by which all must be done, and whether somebody wanted an end before."""
+    """When all must be done; `ended` is set where somebody wants an end before."""
 
     def __init__(self, seconds: float) -> None:
         """So many seconds from now."""
         self._end, self._seconds = time.monotonic() + seconds, seconds
         self.ended = threading.Event()
 
-    def end(self) -> None:
-        """Nothing more is to be done, and what runs is ended."""
-        self.ended.set()
-
     def left_s(self) -> float:
-        """Return what is left [s].
-
-        Raises:
-            DeployError: Nothing.
-        """
+        """What is left [s]; DeployError: nothing."""
         if self.ended.is_set():
             raise DeployError("interrupted")
         left = self._end - time.monotonic()
@@ -178,7 +170,7 @@ class Remote:
     deadline: Deadline
 
     def run(
-        self, command: Sequence[str], send: bytes, on_line: Callable[[str], None], limit_s: float = 1e9
+        self, command: Sequence[str], send: bytes, on_line: Callable[[str], None], limit_s: float = math.inf
     ) -> int:
         """Run a command there, with input `send`, and return its exit code.
 
@@ -186,14 +178,10 @@ class Remote:
             DeployError: The machine is not reached, the link broke, or the time is over.
         """
         words = [*self._ssh(), "--", self.host, shlex.join(command)]
-        code, errors = run_bounded(
-            words, send, on_line, min(limit_s, self.deadline.left_s()), ended=self.deadline.ended
-        )
+        code, errors = self._bounded(words, send, on_line, limit_s)
         if code is None:
-            self.deadline.left_s()
             raise DeployError(f"no answer within {limit_s:.0f} s")
-        not_reached = 255  # ssh's own exit code
-        if code == not_reached:
+        if code == 255:  # ssh's own: not reached
             raise DeployError(_plain(errors, self.host))
         if code != 0 and errors:
             on_line(f"! {errors[-1]}")
@@ -205,18 +193,25 @@ class Remote:
         Raises:
             DeployError: The machine is not reached, its disk is full, the link broke, or the time is over.
         """
-        stalled_s = 15
-        words = ["rsync", "--partial", "--times", "--mkpath", f"--timeout={stalled_s}"]
+        words = ["rsync", "--partial", "--times", "--mkpath", "--timeout=15"]
         if sudo:
             words += ["--rsync-path", "sudo -n rsync"]
-        words += ["-e", shlex.join(self._ssh()), "--", *map(str, files), f"{_bracketed(self.host)}:{to}/"]
-        code, errors = run_bounded(
-            words, b"", lambda _line: None, self.deadline.left_s(), ended=self.deadline.ended
-        )
-        if code is None:
-            self.deadline.left_s()
+        user, at, address = self.host.rpartition("@")
+        host = f"{user}{at}[{address}]" if ":" in address else self.host  # as rsync wants an IPv6 address
+        words += ["-e", shlex.join(self._ssh()), "--", *map(str, files), f"{host}:{to}/"]
+        code, errors = self._bounded(words, b"", lambda _line: None)
         if code != 0:
             raise DeployError(f"rsync: {_plain(errors, self.host)}")
+
+    def _bounded(
+        self, words: Sequence[str], send: bytes, on_line: Callable[[str], None], limit_s: float = math.inf
+    ) -> tuple[int | None, list[str]]:
+        """As `run_bounded`; None: after `limit_s`, and DeployError after the deadline."""
+        limit_s = min(limit_s, self.deadline.left_s())
+        found = run_bounded(words, send, on_line, limit_s, ended=self.deadline.ended)
+        if found[0] is None:
+            self.deadline.left_s()
+        return found
 
     def _ssh(self) -> list[str]:
         return ["ssh", *(word for setting in _SETTINGS for word in ("-o", setting)), *self.options]
@@ -266,8 +261,7 @@ def run_bounded(
     try:
         while code is None and time.monotonic() < end and not (ended is not None and ended.is_set()):
             with contextlib.suppress(subprocess.TimeoutExpired):
-                poll_s = 0.5
-                code = child.wait(min(poll_s, max(0.0, end - time.monotonic())))
+                code = child.wait(min(0.5, max(0.0, end - time.monotonic())))
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(child.pid, signal.SIGKILL)
@@ -299,15 +293,6 @@ def _plain(errors: Sequence[str], host: str) -> str:
     for sign, hint in _HINTS:
         if sign in text:
             return f"{sign}: {hint.replace('HOST', host).replace('ADDRESS', host.rpartition('@')[2])}"
-    own = [
-        line
-        for line in errors
-        if not line.startswith(("Warning:", "** ", "rsync error: error in rsync protocol"))
-    ]
+    noise = ("Warning:", "** ", "rsync error: error in rsync protocol")
+    own = [line for line in errors if not line.startswith(noise)]
     return (own or ["the connection broke"])[0].removeprefix("ssh: ")
-
-
-def _bracketed(host: str) -> str:
-    """As rsync wants an IPv6 address."""
-    user, at, address = host.rpartition("@")
-    return f"{user}{at}[{address}]" if ":" in address else host

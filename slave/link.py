@@ -59,6 +59,7 @@ from common.messages import WIRE_VERSION, Message, encode
 VANISHED_NS = 2_000_000_000  # a master silent for so long is gone
 HELLO_AGAIN_NS = 50_000_000
 OFFER_NS = 1_000_000_000  # how long hello is repeated after the last beacon
+NONCE_NS = 2_000_000_000  # how long an unanswered offer keeps its nonce
 _DUPLICATE_SENDER = "the master has another process that is {!r}: two of one name, end one of them"
 _OTHER_VERSION = "the master at {} speaks wire version {}, this slave {}: install one version on both"
 
@@ -126,10 +127,10 @@ class SlaveLink:
     @property
     def wrong(self) -> str | None:
         """Why no master accepts this slave, if known: duplicate, wire version, secret."""
-        lately_ns = 2_500_000_000  # so long after it was last seen something is reported as wrong
-        if self._wrong is None or not 0 <= self._clock.now_ns() - self._wrong[0] < lately_ns:
+        if self._wrong is None:
             return None
-        return self._wrong[1]
+        t_ns, why = self._wrong
+        return why if 0 <= self._clock.now_ns() - t_ns < 2_500_000_000 else None
 
     def state(self, t_ns: int) -> State:
         """State of the handshake at `t_ns`, on this slave's clock."""
@@ -185,11 +186,8 @@ class SlaveLink:
         t_ns = self._clock.now_ns()
         offer = self._offer
         # A clock that was set back is no reason to be silent until it is there again.
-        if (
-            offer is not None
-            and t_ns - offer.received_ns < OFFER_NS
-            and not 0 < offer.next_ns - t_ns <= HELLO_AGAIN_NS
-        ):
+        is_due = offer is not None and not 0 < offer.next_ns - t_ns <= HELLO_AGAIN_NS
+        if offer is not None and is_due and t_ns - offer.received_ns < OFFER_NS:
             self._send_hello(offer, t_ns)
         outbox, self._outbox = self._outbox, []
         return outbox
@@ -229,24 +227,18 @@ class SlaveLink:
         if counter <= session.beacon_counter and not vanished:
             return Event.BEACON_OLD
         listed = beacon.sessions.get(self._name) == session.key_id
-        unlisted_ns = 1_000_000_000
-        return (
-            Event.BEACON_LISTED if listed or t_ns - session.since_ns < unlisted_ns else Event.BEACON_UNLISTED
-        )
+        is_new = t_ns - session.since_ns < 1_000_000_000
+        return Event.BEACON_LISTED if listed or is_new else Event.BEACON_UNLISTED
 
     def _answer(self, beacon: Beacon, counter: int, address: Address, t_ns: int) -> None:
-        old, since_ns = self._offer, t_ns
-        if (
-            old is not None
-            and old.beacon.master_nonce == beacon.master_nonce
-            and t_ns - old.received_ns < OFFER_NS
-        ):
-            since_ns = old.since_ns
-        nonce_ns = 2_000_000_000
-        if old is not None and 0 <= t_ns - old.drawn_ns < nonce_ns:
-            nonce, drawn_ns = old.slave_nonce, old.drawn_ns
-        else:
-            nonce, drawn_ns = self._random(NONCE_BYTES), t_ns
+        old, since_ns, nonce, drawn_ns = self._offer, t_ns, b"", t_ns
+        if old is not None:
+            same_master = old.beacon.master_nonce == beacon.master_nonce
+            if same_master and t_ns - old.received_ns < OFFER_NS:
+                since_ns = old.since_ns
+            if 0 <= t_ns - old.drawn_ns < NONCE_NS:
+                nonce, drawn_ns = old.slave_nonce, old.drawn_ns
+        nonce = nonce or self._random(NONCE_BYTES)
         self._offer = _Offer(nonce, beacon, counter, address, t_ns, t_ns, since_ns, drawn_ns)
         self._send_hello(self._offer, t_ns)
 
@@ -254,13 +246,8 @@ class SlaveLink:
         """Refusal if the master lists another process of this name."""
         listed = beacon.sessions.get(self._name)
         ours = None if self._session is None else self._session.key_id
-        # unanswered for so long while the beacons list the name: another process has it
-        duplicate_sender_ns = 1_000_000_000
-        if (
-            self._offer is None
-            or listed in (None, ours)
-            or not t_ns - self._offer.since_ns >= duplicate_sender_ns
-        ):
+        # unanswered for a second while the beacons list the name: another process has it
+        if self._offer is None or listed in (None, ours) or t_ns - self._offer.since_ns < 1_000_000_000:
             return None
         self._wrong = t_ns, _DUPLICATE_SENDER.format(self._name)
         return Refusal.DUPLICATE_SENDER

@@ -4,7 +4,7 @@ A device that is gone raises `CameraError`; a wrist device that is not calibrate
 """
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
@@ -18,19 +18,17 @@ from common.calibration.camera_settings import ColourPick
 from common.errors import CameraError
 from common.hand.model import FINGERS
 from slave.markers.colours import SampledColours
-from slave.markers.detector import MarkerDetector, ambiguity_counts, ambiguity_metrics
+from slave.markers.detector import Detections, MarkerDetector, ambiguity_counts, ambiguity_metrics
 from slave.markers.engine import Engine
 from slave.markers.reloadable import (
     AnyDetector,
     CalibratedDetector,
-    NullDetector,
     ReloadableDetector,
     can_adapt,
     detector_for,
     marker_changes,
 )
 from slave.markers.scan import Scan, ScanChoice
-from slave.markers.white_balance import ColourWarning
 from slave.preview import MarkerOverlay, Previews, WristOverlay
 from slave.raw import RawFrames, RawSettings
 from slave.report import DetectionCounters
@@ -38,7 +36,7 @@ from slave.sender import MarkerPipeline, Sender, WristPipeline
 from slave.sources import Frame, FrameSource, Reporting
 from slave.tags.offline import LiveTags, finder_of
 from slave.tuning import CameraFiles, CameraTuning, Prepare, Sample
-from slave.wrist.detector import NullWristDetector, WristDetector, view_of, wrist_changes
+from slave.wrist.detector import WristDetector, view_of, wrist_changes
 from slave.wrist.engine import Engine as WristEngine
 
 
@@ -53,20 +51,21 @@ class ColourSampler:
         self._picked = SampledColours()
 
     def pick(
-        self, wish: ColourPick, camera: CameraCalibration
+        self, request: ColourPick, camera: CameraCalibration
     ) -> tuple[CameraCalibration, Mapping[str, float]]:
         """The camera file with the clicked colour; its pixels and what its range holds."""
         every = camera.markers or {}
         ranges = {name: every[name] for name in self._markers if name in every}
-        light = self._detector.log_gains
-        done = self._picked.sample(self._image(wish.t_ns), light, wish.marker, wish.uv, ranges)
+        adaptive = self._detector.adaptive
+        light = np.zeros(3) if adaptive is None else adaptive.log_gains
+        made, row = self._picked.sample(self._image(request.t_ns), light, request.marker, request.uv, ranges)
         report = {
-            "pick.pixels": float(done.row.pixels),
-            "pick.own_share": done.row.own,
-            "pick.skin_share": done.row.skin,
-            "pick.background_px": done.row.background_px,
+            "pick.pixels": float(row.pixels),
+            "pick.own_share": row.own,
+            "pick.skin_share": row.skin,
+            "pick.background_px": row.background_px,
         }
-        return replace(camera, markers=every | done.ranges), report
+        return replace(camera, markers=every | made), report
 
     def _image(self, t_ns: int | None) -> Image:
         """The picture that was clicked on, or else the newest one."""
@@ -85,25 +84,18 @@ _LOG = logging.getLogger(__name__)
 
 
 class LightReport(Reporting):
-    """Counts and logs how the light affects colours; adds it to what `others` report."""
+    """Counts and logs how the light affects colours."""
 
-    def __init__(
-        self,
-        name: str,
-        detector: ReloadableDetector,
-        others: Reporting,
-        markers: tuple[str, ...],
-        show: Callable[[Frame], None] = lambda _frame: None,
-    ) -> None:
-        self._name, self._detector, self._others, self._show = name, detector, others, show
+    def __init__(self, name: str, detector: ReloadableDetector, markers: tuple[str, ...]) -> None:
+        self._name, self._detector = name, detector
         self._warned = dict.fromkeys((ALL, *markers), 0)
         self._now: set[str] = set()
         self._logged_ns: dict[str, int] = {}
 
     def offer(self, frame: Frame) -> None:
-        """Take note of the warnings after a frame, and hand it on."""
-        self._show(frame)
-        warnings = self._detector.warnings
+        """Take note of the warnings after a frame."""
+        adaptive = self._detector.adaptive
+        warnings = [] if adaptive is None else adaptive.warnings
         if not warnings and not self._now:
             return
         now = {ALL if warning.marker is None else warning.marker for warning in warnings}
@@ -118,25 +110,25 @@ class LightReport(Reporting):
                 _LOG.warning("%s: %s", self._name, warning.text)
 
     def counts(self) -> dict[str, int]:
-        """Those of the others; warnings.light, warnings.<marker>, refused.light, ..."""
+        """warnings.light, warnings.<marker>, refused.light, colour_tables."""
         warned = {f"warnings.{subject}": count for subject, count in self._warned.items()}
-        own = {"refused.light": self._detector.refused, "colour_tables": self._detector.tables}
-        return {**self._others.counts(), **warned, **own}
+        adaptive = self._detector.adaptive
+        refused, tables = (0, 0) if adaptive is None else (adaptive.refused, adaptive.tables)
+        return warned | {"refused.light": refused, "colour_tables": tables}
 
     def metrics(self) -> dict[str, float]:
-        """Those of the others; light_red, light_blue by green; alike.<one>..<other>."""
-        if not self._detector.adapts:
-            return dict(self._others.metrics())
-        blue, green, red = np.exp(self._detector.log_gains).tolist()
-        light = {"light_red": red / green, "light_blue": blue / green, "light_exposure": green}
-        return {**self._others.metrics(), **light, **_ambiguous(self._detector.warnings)}
-
-
-def _ambiguous(warnings: list[ColourWarning]) -> dict[str, float]:
-    # A name in `Health` has 64 characters
-    return {
-        f"alike.{one.marker}..{one.ambiguous}"[:64]: one.hues for one in warnings if one.ambiguous is not None
-    }
+        """light_red, light_blue by green; alike.<one>..<other>; {}: none adapts."""
+        adaptive = self._detector.adaptive
+        if adaptive is None:
+            return {}
+        blue, green, red = np.exp(adaptive.log_gains).tolist()
+        # A name in `Health` has 64 characters
+        alike = {
+            f"alike.{one.marker}..{one.ambiguous}"[:64]: one.hues
+            for one in adaptive.warnings
+            if one.ambiguous is not None
+        }
+        return {"light_red": red / green, "light_blue": blue / green, "light_exposure": green} | alike
 
 
 Colours = Literal["follow", "fixed", "none"]
@@ -177,7 +169,6 @@ def send_detections(
     sender.send(
         raw.reading(source),
         line.pipeline,
-        reported=line.reported,
         previews=line.previews,
         parts=(tuning, raw),
         close=(raw.close, lambda: workers.shutdown(cancel_futures=True)),
@@ -192,7 +183,6 @@ class _Line:
     previews: Previews
     prepare: Prepare | None = None
     sample: Sample | None = None
-    reported: LightReport | None = None
 
 
 def _marker_line(
@@ -206,35 +196,38 @@ def _marker_line(
     rig, name, uplink = files.rig, sender.name, sender.uplink
     tags = LiveTags(files.camera, files.objects)
     if colours == "none":
-        null, counters = NullDetector(len(rig.markers)), DetectionCounters(rig.markers, tags.counts)
-        previews = Previews(name, sender.clock)
-        pipeline = MarkerPipeline(name, uplink.session, uplink.send, null.push, counters, previews.offer)
+        nothing, previews = Detections.none(len(rig.markers)), Previews(name, sender.clock)
+        counters = DetectionCounters(rig.markers, tags.counts)
+        wire = uplink.session, uplink.send
+        pipeline = MarkerPipeline(name, *wire, lambda _image, _t_ns: nothing, counters, previews.offer)
         return _Line(pipeline, previews)
     make = _maker(files, colours, engine, workers)
     choice = ScanChoice(scan, files.camera)
     detector = ReloadableDetector(make(files.camera, rig), choice)
-    counters = DetectionCounters(
-        rig.markers,
-        lambda: (
-            tags.counts()
-            | _uncalibrated(detector.missing)
-            | {"windows": choice.frames}
-            | ambiguity_counts(detector.plain)
-        ),
-        lambda: ambiguity_metrics(detector.plain),
-    )
     previews = Previews(name, sender.clock, MarkerOverlay(detector, rig.markers))
-    light = show = None
-    if colours == "follow":
-        light = LightReport(name, detector, counters, rig.markers, previews.offer)
-        show = light.offer
-    show = show or previews.offer
+    light = LightReport(name, detector, rig.markers) if colours == "follow" else None
+
+    def counts() -> dict[str, int]:
+        found = tags.counts() | {"uncalibrated": int(bool(detector.missing))}
+        found |= {f"uncalibrated.{marker}": 1 for marker in detector.missing}
+        found |= {"windows": choice.frames} | ambiguity_counts(detector.plain)
+        return found if light is None else found | light.counts()
+
+    def metrics() -> dict[str, float]:
+        found = ambiguity_metrics(detector.plain)
+        return found if light is None else found | light.metrics()
+
+    def show(frame: Frame) -> None:
+        previews.offer(frame)
+        if light is not None:
+            light.offer(frame)
+
+    counters = DetectionCounters(rig.markers, counts, metrics)
     return _Line(
         MarkerPipeline(name, uplink.session, uplink.send, detector.push, counters, show, tags.push),
         previews,
         _both(marker_changes(detector, make), _tag_changes(tags)),
         ColourSampler(detector, previews.shown, rig.markers).pick,
-        light,
     )
 
 
@@ -242,9 +235,9 @@ def _wrist_line(sender: Sender, files: CameraFiles, colours: Colours, engine: Wr
     name, uplink = sender.name, sender.uplink
     if colours == "none":
         counters, previews = DetectionCounters(()), Previews(name, sender.clock)
-        detect = NullWristDetector().push
         return _Line(
-            WristPipeline(name, uplink.session, uplink.send, detect, counters, previews.offer), previews
+            WristPipeline(name, uplink.session, uplink.send, lambda _: None, counters, previews.offer),
+            previews,
         )
     detector = WristDetector(view_of(files), files.camera.frame_rate_hz, engine=engine)
     names = tuple(f"{what}.{finger}" for what in ("laser", "tip") for finger in FINGERS)
@@ -285,10 +278,6 @@ def _both(first: Prepare, second: Prepare) -> Prepare:
         return switch
 
     return prepare
-
-
-def _uncalibrated(missing: Sequence[str]) -> dict[str, int]:
-    return {"uncalibrated": int(bool(missing))} | {f"uncalibrated.{name}": 1 for name in missing}
 
 
 def _maker(

@@ -3,7 +3,7 @@
 At most 10 Hz, and nothing without a recent request: the loop only offers its frames. A thread of its own shrinks,
 draws, encodes and publishes; while it is busy the newest frame replaces the waiting one, so a slow bus costs pictures
 and never a measurement. A *still*, one whole frame on request, goes the same way: cameras are calibrated from stills.
-Of several who look, each sees what all have wished for in the last three seconds.
+Of several who look, each sees what all have requested in the last three seconds.
 """
 
 import logging
@@ -20,7 +20,7 @@ from common.calibration import HsvRange
 from common.clock import Clock
 from common.errors import BusError, CalibrationError
 from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Preview, Still
-from common.messages.command_bodies import PreviewWish
+from common.messages.command_bodies import PreviewRequest
 from slave.markers.classify import HUES
 from slave.markers.reloadable import ReloadableDetector
 from slave.sources import Failures, Frame
@@ -37,12 +37,7 @@ class MarkerOverlay:
     """Overlay of a camera that looks for markers, by the detector in use."""
 
     def __init__(self, detector: ReloadableDetector, markers: tuple[str, ...]) -> None:
-        self._detector, self._markers = detector, markers
-
-    @property
-    def markers(self) -> tuple[str, ...]:
-        """Those of the rig."""
-        return self._markers
+        self._detector, self.markers = detector, markers
 
     def draw(self, small: Image, frame: Frame, mask: Sequence[str], found: bool) -> Image:
         """New image of `small`, (h, w, 3) or (h, w), with tinted markers and crosses.
@@ -62,15 +57,12 @@ class MarkerOverlay:
 
 
 class WristOverlay:
-    """Overlay of the camera of a wrist device."""
+    """Overlay of the camera of a wrist device, which looks for fingers."""
+
+    markers: tuple[str, ...] = ()
 
     def __init__(self, detector: WristDetector) -> None:
         self._detector = detector
-
-    @property
-    def markers(self) -> tuple[str, ...]:
-        """None: it looks for fingers."""
-        return ()
 
     def draw(self, small: Image, frame: Frame, mask: Sequence[str], found: bool) -> Image:
         """New image with crosses at laser points (red) and tips (green)."""
@@ -118,7 +110,7 @@ def _cross(drawn: Image, uv: Float, whole: Image, colour: tuple[int, int, int]) 
 
 PERIOD_NS = 100_000_000
 POLL_NS = 3_000_000_000
-FOUND = ""  # stands beside the names of markers for the wish to see what was found
+FOUND = ""  # stands beside the names of markers for the request to see what was found
 STILL_QUALITIES = (95, 90, 80, 60, 30)  # the first whose file fits into a message
 _LOG = logging.getLogger(__name__)
 
@@ -151,7 +143,7 @@ class Previews:
     ) -> None:
         """Start the thread; nothing is published before `use` and `ask`."""
         self._camera, self._overlay = camera, overlay
-        self._wishes: dict[str, int] = {}  # what -> until when [ns]
+        self._requests: dict[str, int] = {}  # what -> until when [ns]
         # The last second, for a click on one of them
         self._shown: deque[Frame] = deque(maxlen=10)
         self._clock = clock
@@ -169,17 +161,17 @@ class Previews:
         self._thread.start()
 
     def ask(self, body: str = "") -> None:
-        """Show the camera for 3 s, as a `PreviewWish` asks; else `CalibrationError`."""
-        wish = PreviewWish.of(body)
+        """Show the camera for 3 s, as a `PreviewRequest` asks; else `CalibrationError`."""
+        request = PreviewRequest.of(body)
         known = () if self._overlay is None else self._overlay.markers
-        if strange := [name for name in wish.mask if name not in known]:
+        if strange := [name for name in request.mask if name not in known]:
             raise CalibrationError(
                 f"preview: mask: camera {self._camera!r} does not look for {', '.join(strange)}; it looks for "
                 f"{', '.join(known) or 'no markers'}"
             )
         now_ns = self._clock.now_ns()
-        until = dict.fromkeys((*wish.mask, *((FOUND,) if wish.found else ())), now_ns + POLL_NS)
-        self._wishes = {what: end for what, end in self._wishes.items() if end >= now_ns} | until
+        until = dict.fromkeys((*request.mask, *((FOUND,) if request.found else ())), now_ns + POLL_NS)
+        self._requests = {what: end for what, end in self._requests.items() if end >= now_ns} | until
         self._gate.ask(now_ns)
 
     def shown(self, t_ns: int) -> Frame | None:
@@ -230,12 +222,12 @@ class Previews:
             self._publish("preview", Preview(self._camera, frame.t_ns, self._picture(frame)))
 
     def _picture(self, frame: Frame) -> bytes:
-        """The JPEG file of a frame, with what is wished for."""
-        wishes = [what for what, end in self._wishes.items() if end >= frame.t_ns]
-        if self._overlay is None or not wishes:
+        """The JPEG file of a frame, with what is requested."""
+        requested = [what for what, end in self._requests.items() if end >= frame.t_ns]
+        if self._overlay is None or not requested:
             return small_jpeg(frame.image)
-        mask = [what for what in wishes if what != FOUND]
-        return _within(self._overlay.draw(_half(frame.image), frame, mask, FOUND in wishes))
+        mask = [what for what in requested if what != FOUND]
+        return _within(self._overlay.draw(_half(frame.image), frame, mask, FOUND in requested))
 
     def _send_whole(self, frame: Frame) -> None:
         data = whole_jpeg(frame.image)

@@ -1,6 +1,6 @@
 """Record raw frames to disk while the slave goes on detecting.
 
-    raw         begin a recording of raw frames (body: `common.messages.command_bodies.RawWish`), or ask for it to go on
+    raw         begin a recording of raw frames, or ask for it to go on (body: `command_bodies.RawRequest`)
     raw_stop    end it; the answer comes when every frame that waited is written
 
 What is written is a folder as `phalanx-slave record` makes it, by the same recorder. The loop hands a frame over when
@@ -20,7 +20,7 @@ from pathlib import Path
 from common.calibration import CameraCalibration, load
 from common.clock import Clock
 from common.errors import CalibrationError, RecordingError
-from common.messages.command_bodies import RawWish
+from common.messages.command_bodies import RawRequest
 from common.recording.frame_recording import Manifest
 from slave.recorder import ENCODERS, RESERVE_BYTES, Length, Recorder, clock_of, megabytes
 from slave.sources import Frame, FrameSource, Reporting
@@ -123,18 +123,18 @@ class RawFrames(Reporting):
 
     def _raw(self, body: str) -> dict[str, float]:
         settings = self._wanted("raw")
-        wish = RawWish.of(body)
+        request = RawRequest.of(body)
         with self._command_lock:
             self._look()
             if self._recorder is None:
-                if self._failure is not None and wish.name == self._name:
+                if self._failure is not None and request.name == self._name:
                     raise RecordingError(f"raw: {self._failure}")
-                self._begin(wish, settings)
-            elif wish.name != self._name:
+                self._begin(request, settings)
+            elif request.name != self._name:
                 raise RecordingError(
                     f"raw: {settings.folder / self._name} is being recorded: raw_stop ends it"
                 )
-            self._lease_s, self._until = wish.lease_s, time.monotonic() + wish.lease_s
+            self._lease_s, self._until = request.lease_s, time.monotonic() + request.lease_s
         return self.metrics()
 
     def _raw_stop(self, body: str) -> dict[str, float]:
@@ -152,7 +152,7 @@ class RawFrames(Reporting):
             raise RecordingError(NO_FOLDER.format(verb))
         return self._settings
 
-    def _begin(self, wish: RawWish, settings: RawSettings) -> None:
+    def _begin(self, request: RawRequest, settings: RawSettings) -> None:
         self._join()
         try:
             free = self._free(settings.folder)
@@ -164,7 +164,7 @@ class RawFrames(Reporting):
                 f"{megabytes(settings.reserve_bytes)} stay free ({RESERVE_OPTION}): make room"
             )
         recorder = Recorder(
-            settings.folder / wish.name,
+            settings.folder / request.name,
             self._manifest(settings),
             self._camera,
             Length(),
@@ -173,9 +173,9 @@ class RawFrames(Reporting):
             encoders=max(min(ENCODERS, (os.cpu_count() or 1) - 1), 1),  # a core stays with the loop
             reserve_option=RESERVE_OPTION,
         )
-        self._name, self._failure, self._fault, self._here_at = wish.name, None, None, time.monotonic()
+        self._name, self._failure, self._fault, self._here_at = request.name, None, None, time.monotonic()
         self._last = self._recorder = recorder
-        _LOG.info("raw frames into %s", settings.folder / wish.name)
+        _LOG.info("raw frames into %s", settings.folder / request.name)
 
     def _manifest(self, settings: RawSettings) -> Manifest:
         files = self._files()

@@ -14,7 +14,6 @@ import threading
 import zlib
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import cv2
@@ -32,14 +31,6 @@ from slave.sources import Failures, Frame, FrameSource, Reporting, Source, Tunab
 ItemT = TypeVar("ItemT", Frame, ImuSample, TrackerPose)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Backoff:
-    """Waits between tries to open a device, twice as long each time."""
-
-    first_s: float = 0.2
-    longest_s: float = 1.0
-
-
 class ReconnectingDriver(Reporting, Generic[ItemT]):
     """A driver around one whose device can be lost."""
 
@@ -52,7 +43,8 @@ class ReconnectingDriver(Reporting, Generic[ItemT]):
         connection_lost: ConnectionLost = nobody,
         *,
         rate_hz: float = 0.0,
-        backoff: Backoff | None = None,
+        first_s: float = 0.2,
+        longest_s: float = 1.0,
         prefix: str = "",
     ) -> None:
         """Open the device; `opener` is called again after each loss.
@@ -63,18 +55,19 @@ class ReconnectingDriver(Reporting, Generic[ItemT]):
             stop: Set when the slave is to end; `read` then waits for the device no longer.
             connection_lost: Called when it is lost, and before each try to open it again.
             rate_hz: Counts the items of an absence; 0: numbers go on without a gap.
+            first_s: Wait before the first try to open it again [s]; twice as long each time, up to `longest_s`.
             prefix: Stands before the names of its counts and metrics.
         """
         self._device, self._open, self._clock, self._stop = device, opener, clock, stop
         self._connection_lost, self._prefix = connection_lost, prefix
-        self._rate_hz, self._backoff = rate_hz, backoff or Backoff()
+        self._rate_hz, self._first_s, self._longest_s = rate_hz, first_s, longest_s
         self._closed = threading.Event()
         self._source: Source[ItemT] | None = opener()
         self._offset = 0  # added to the driver's own numbers
         self._opened_again = False  # and no item was read since
         self._last: tuple[int, int] | None = None  # seq, t_ns
         self._away_ns: int | None = None  # since when; until an item has come
-        self._wait_s = self._left_s = self._backoff.first_s
+        self._wait_s = self._left_s = first_s
         self._why = ""
         self._counts = Counter({"lost": 0, "back": 0})
         self._closed_counts: Counter[str] = Counter()  # of the drivers that were closed
@@ -169,7 +162,7 @@ class ReconnectingDriver(Reporting, Generic[ItemT]):
         if self._left_s > 0.0:
             return None
         self._connection_lost(f"{self._device} away: {self._why}")
-        self._wait_s = min(2.0 * self._wait_s, self._backoff.longest_s)  # until an item has come
+        self._wait_s = min(2.0 * self._wait_s, self._longest_s)  # until an item has come
         self._left_s = self._wait_s
         try:
             self._source = self._open()
@@ -186,7 +179,7 @@ class ReconnectingDriver(Reporting, Generic[ItemT]):
         if self._away_ns is not None and self._ends_absence(item):
             self._failures.over(f"back after loss number {self._counts['lost']}")
             self._counts["back"] += 1
-            self._away_ns, self._wait_s = None, self._backoff.first_s
+            self._away_ns, self._wait_s = None, self._first_s
         if self._last is not None and (self._opened_again or not self._rate_hz):
             seq, t_ns = self._last
             self._offset = seq + max(1, round((item.t_ns - t_ns) * 1e-9 * self._rate_hz)) - item.seq
@@ -207,21 +200,20 @@ class ReconnectingTracker(ReconnectingDriver[TrackerPose]):
         stop: threading.Event,
         connection_lost: ConnectionLost = nobody,
         *,
-        backoff: Backoff | None = None,
-        absent_s: float = 0.25,
+        longest_s: float = 10.0,
     ) -> None:
-        """Open the tracker `name`; from one pose of NaN to the next are `absent_s` [s].
+        """Open the tracker `name`.
 
         Tries are at most 10 s apart, as each leaves 100 kB in openvr (ValveSoftware/openvr, issue 1221).
         """
-        self._name, self._absent_s = name, absent_s
-        backoff = backoff or Backoff(longest_s=10.0)
-        super().__init__("tracker", opener, clock, stop, connection_lost, backoff=backoff)
+        self._name = name
+        super().__init__("tracker", opener, clock, stop, connection_lost, longest_s=longest_s)
 
     def _wait(self) -> TrackerPose:
-        self._stop.wait(self._absent_s)
-        self._left_s -= self._absent_s
-        t_ns = self._clock.now_ns() - round(0.5e9 * self._absent_s)
+        absent_s = 0.25  # from one pose of NaN to the next
+        self._stop.wait(absent_s)
+        self._left_s -= absent_s
+        t_ns = self._clock.now_ns() - round(0.5e9 * absent_s)
         if self._last is not None:
             t_ns = max(t_ns, self._last[1] + 1)
         return TrackerPose(self._name, 0, 0, t_ns, np.full(3, np.nan), np.full(4, np.nan))
@@ -279,7 +271,8 @@ class ReconnectingCamera(ReconnectingDriver[Frame], Tunable):
         stop: threading.Event,
         connection_lost: ConnectionLost = nobody,
         *,
-        backoff: Backoff | None = None,
+        first_s: float = 0.2,
+        longest_s: float = 1.0,
         frozen_s: float = 1.0,
     ) -> None:
         """Open the camera; one that repeats a picture for `frozen_s` [s] is lost."""
@@ -291,7 +284,8 @@ class ReconnectingCamera(ReconnectingDriver[Frame], Tunable):
             stop,
             connection_lost,
             rate_hz=camera.frame_rate_hz,
-            backoff=backoff,
+            first_s=first_s,
+            longest_s=longest_s,
             prefix="camera.",
         )
         self._pictures = RepeatedPictures()

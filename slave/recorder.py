@@ -39,10 +39,8 @@ class Length:
 
     def expected(self, rate_hz: float) -> int | None:
         """How many frames that is at `rate_hz` frames per second; None: not known."""
-        counts = [] if self.frames is None else [self.frames]
-        if self.seconds is not None:
-            counts.append(math.ceil(self.seconds * rate_hz))
-        return min(counts, default=None)
+        by_time = None if self.seconds is None else math.ceil(self.seconds * rate_hz)
+        return min((count for count in (self.frames, by_time) if count is not None), default=None)
 
     def left_s(self, elapsed_s: float, frames: int, rate_hz: float) -> float | None:
         """Time left [s] after `elapsed_s` and `frames`; 0: reached; None: until stopped."""
@@ -81,10 +79,9 @@ class ProgressDisplay:
     def show(self, progress: Progress) -> None:
         """Show the progress; called once a second."""
         self._calls += 1
-        plain_every = 5  # calls, where no terminal shows the line in place
         if self._stream.isatty():
             self._write(f"\r{self._name}: {progress_text(progress)}\x1b[K")
-        elif self._calls % plain_every == 0:
+        elif self._calls % 5 == 0:
             self._write(f"{self._name}: {progress_text(progress)}\n")
 
     def end(self, progress: Progress) -> None:
@@ -108,8 +105,7 @@ def progress_text(progress: Progress) -> str:
     parts = [f"{progress.frames} frames", f"{progress.dropped} dropped"]
     if progress.lost:
         parts.append(f"{progress.lost} lost by the camera")
-    parts.append(f"queue {progress.waiting}/{progress.capacity}")
-    parts.append(f"{progress.bytes_per_s * 1e-6:.1f} MB/s")
+    parts += [f"queue {progress.waiting}/{progress.capacity}", f"{progress.bytes_per_s * 1e-6:.1f} MB/s"]
     parts.append(f"{megabytes(progress.free_bytes)} free")
     if progress.disk_s < (math.inf if progress.left_s is None else progress.left_s):
         parts.append(f"disk full in {progress.disk_s:.0f} s")

@@ -96,15 +96,17 @@ class Reporter:
         self._thread.join()
 
     def _work(self) -> None:
+        log_every = 20  # reports
         count = 0
         while not self._closing.wait(self._period_s):
-            log_every = 20  # reports
             if count % log_every == ALONE_AT and self._uplink.zenoh_endpoint is None:
                 _LOG.warning("%s", _why_alone(self._uplink.counts))
             try:
+                metrics = dict(self._counters.metrics())
                 for part in self._parts:
                     part.look()
-                self._metrics = self._measured()
+                    metrics |= part.metrics()
+                self._metrics = metrics | self._machine.metrics()
                 self._follow(self._uplink.zenoh_endpoint)
                 if self._bus is not None:
                     self._bus.publish("health", self._name, self.health())
@@ -118,12 +120,6 @@ class Reporter:
                 _LOG.info("%s", "  ".join(f"{k} {_short(v)}" for k, v in self._metrics.items()))
             count += 1
         self._leave()
-
-    def _measured(self) -> dict[str, float]:
-        metrics = dict(self._counters.metrics())
-        for part in self._parts:
-            metrics |= part.metrics()
-        return metrics | self._machine.metrics()
 
     def _follow(self, endpoint: str | None) -> None:
         if endpoint is None or endpoint == self._endpoint:
@@ -149,18 +145,19 @@ def _short(value: float) -> str:
     return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
 
 
+_REFUSED = {
+    "foreign": "of another rig key (or another program): compare the key files of both sides",
+    "version": "of another version of the wire: install the same version on both sides",
+    "secret": "not with the secret of this device: phalanx fleet deploy brings what fits",
+    "duplicate_sender": "it has somebody of this name already: two slaves of one name?",
+}
+
+
 def _why_alone(counts: Mapping[str, int]) -> str:
     """What to look at when no master has answered, by what was refused."""
-    if counts.get("refused.foreign", 0):
-        return "a master is received, but of another rig key (or another program): compare the key files of both sides"
-    if counts.get("refused.version", 0):
-        return (
-            "a master is received, but of another version of the wire: install the same version on both sides"
-        )
-    if counts.get("refused.secret", 0):
-        return "a master is received, but not with the secret of this device: phalanx fleet deploy brings what fits"
-    if counts.get("refused.duplicate_sender", 0):
-        return "a master is received, but it has somebody of this name already: two slaves of one name?"
+    why = next((text for reason, text in _REFUSED.items() if counts.get(f"refused.{reason}", 0)), None)
+    if why is not None:
+        return f"a master is received, but {why}"
     return "no master received yet: is it running, and does its --beacon reach this network and port?"
 
 
@@ -173,11 +170,13 @@ class Counters(Reporting):
         gaps: str = "dropped",
         empty: str = "",
         *,
+        source: object = None,
         counts: Callable[[], Mapping[str, int]] = dict[str, int],
         metrics: Callable[[], Mapping[str, float]] = dict[str, float],
     ) -> None:
-        """Count `items`, `gaps` in their numbers, `empty` ones, and more that are finite."""
+        """Count `items`, `gaps` in their numbers, `empty` ones; add what `source` counts."""
         self._items, self._gaps, self._empty = items, gaps, empty
+        self._source = source if isinstance(source, Reporting) else None
         self._more_counts, self._more_metrics = counts, metrics
         self._lock = threading.Lock()
         self._count = self._missing = self._empty_count = self._failed = 0
@@ -218,25 +217,19 @@ class Counters(Reporting):
             counts = {self._items: self._count, self._gaps: self._missing, "failed": self._failed}
             if self._empty:
                 counts[self._empty] = self._empty_count
-            counts |= self._own_counts()
-        return {**counts, **self._more_counts()}
+        of_source = {} if self._source is None else dict(self._source.counts())
+        return {**counts, **of_source, **self._more_counts()}
 
     def metrics(self) -> dict[str, float]:
-        """rate_hz since the last call, and the others."""
-        more = self._more_metrics()
+        """rate_hz since the last call, and the others, as far as they are finite."""
+        of_source = {} if self._source is None else dict(self._source.metrics())
+        more = {**of_source, **self._more_metrics()}
         now_ns = time.monotonic_ns()
         with self._lock:
             since_ns, count = self._rate_from
             rate_hz = (self._count - count) * 1e9 / max(now_ns - since_ns, 1)
             self._rate_from = (now_ns, self._count)
-            metrics = {"rate_hz": rate_hz, **self._own_metrics(), **more}
-        return {name: value for name, value in metrics.items() if isfinite(value)}
-
-    def _own_counts(self) -> dict[str, int]:
-        return {}
-
-    def _own_metrics(self) -> dict[str, float]:
-        return {}
+        return {name: value for name, value in ({"rate_hz": rate_hz} | more).items() if isfinite(value)}
 
 
 class DetectionCounters(Counters):
@@ -266,43 +259,41 @@ class DetectionCounters(Counters):
             self._empty_frames += not seen.any()
             self._seen += seen
 
-    def _own_counts(self) -> dict[str, int]:
-        """`empty`: frames in which nothing was seen; `seen.<name>`."""
-        seen = {f"seen.{name}": int(count) for name, count in zip(self._names, self._seen, strict=True)}
-        return {"empty": self._empty_frames, **seen}
+    def counts(self) -> dict[str, int]:
+        """Also `empty`: frames in which nothing was seen; `seen.<name>`."""
+        with self._lock:
+            seen = {f"seen.{name}": int(count) for name, count in zip(self._names, self._seen, strict=True)}
+            own = {"empty": self._empty_frames, **seen}
+        return own | super().counts()
 
-    def _own_metrics(self) -> dict[str, float]:
-        """Mean and worst (since the last call) time of detection [us]."""
-        worst_us, self._worst_us = self._worst_us, 0.0
-        return {"detect_us": self._detect_us, "detect_worst_us": worst_us}
+    def metrics(self) -> dict[str, float]:
+        """Also mean and worst (since the last call) time of detection [us]."""
+        with self._lock:
+            own = {"detect_us": self._detect_us, "detect_worst_us": self._worst_us}
+            self._worst_us = 0.0
+        return own | super().metrics()
 
 
 def imu_counters(source: object, orientation: OrientationFilter | None = None) -> Counters:
     """Counters of samples, with what the IMU and its orientation filter report."""
-
-    def counts() -> dict[str, int]:
-        own = dict(source.counts()) if isinstance(source, Reporting) else {}
-        return own | ({} if orientation is None else dict(orientation.counts))
+    if orientation is None:
+        return Counters("samples", "skipped", source=source)
 
     def metrics() -> dict[str, float]:
-        found = dict(source.metrics()) if isinstance(source, Reporting) else {}
-        if orientation is not None:
-            bias = zip("xyz", orientation.bias_rad_s.tolist(), strict=True)
-            found |= {f"bias_{axis}_rad_s": value for axis, value in bias}
-            found["heading_sigma_rad"] = orientation.heading_sigma_rad
-            found["at_rest"] = float(orientation.at_rest)
+        bias = zip("xyz", orientation.bias_rad_s.tolist(), strict=True)
+        found = {f"bias_{axis}_rad_s": value for axis, value in bias}
+        found["heading_sigma_rad"] = orientation.heading_sigma_rad
+        found["at_rest"] = float(orientation.at_rest)
         return found
 
-    return Counters("samples", "skipped", counts=counts, metrics=metrics)
+    return Counters("samples", "skipped", source=source, counts=lambda: orientation.counts, metrics=metrics)
 
 
 def pose_counters(source: object) -> Counters:
     """Counters of poses, those of NaN as `nowhere`; `tracked` 1: yes."""
 
     def metrics() -> dict[str, float]:
-        own = dict(source.metrics()) if isinstance(source, Reporting) else {}
-        return {"tracked": float(counters.found)} | own
+        return {"tracked": float(counters.found)}
 
-    own = source.counts if isinstance(source, Reporting) else dict[str, int]
-    counters = Counters("poses", "skipped", "nowhere", counts=own, metrics=metrics)
+    counters = Counters("poses", "skipped", "nowhere", source=source, metrics=metrics)
     return counters

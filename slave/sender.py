@@ -27,7 +27,7 @@ from common.imu.fusion import OrientationFilter
 from common.messages import ImuSample, MarkerDetections, Message, TagDetections, TrackerPose
 from slave.report import Counters, DetectionCounters, Reporter, imu_counters, pose_counters
 from slave.service import Service
-from slave.sources import Frame, ImuSource, Reporting, Source, TrackerSource
+from slave.sources import Frame, ImuSource, Source, TrackerSource
 from slave.uplink import Uplink
 
 if TYPE_CHECKING:  # of cameras alone: the slave of an IMU starts without them
@@ -247,7 +247,6 @@ class Sender:
         pipeline: Pipeline[ItemT],
         *,
         skips: bool = False,
-        reported: Reporting | None = None,
         previews: "Previews | None" = None,
         parts: "Sequence[CameraTuning | RawFrames]" = (),
         close: Sequence[Callable[[], None]] = (),
@@ -255,13 +254,12 @@ class Sender:
         """Wait for the master, push items until `stop` or their end; close everything.
 
         Where `skips`, items are read before the start, so that none grows old in a buffer: drivers of cameras throw
-        old frames away themselves; of a recording nothing is to be missed. `reported` stands in for the counters in
-        reports.
+        old frames away themselves; of a recording nothing is to be missed.
         """
         reporter = Reporter(
             self.name,
             self.uplink,
-            pipeline.counters if reported is None else reported,
+            pipeline.counters,
             self.clock,
             lambda endpoint: ZenohBus(None, endpoint, self.access),
             self.stop.set,

@@ -118,23 +118,16 @@ class Service:
         return f"\n{WATCHDOG}={period_us}\nWATCHDOG=1" if period_us else "\nWATCHDOG=1"
 
 
-_NUMBERS = (signal.SIGINT, signal.SIGTERM)
-
-
-def stop_on_signals() -> threading.Event:
-    """An event that Ctrl-C and a stop by the system set, until the process ends."""
-    stop = threading.Event()
-    for number in _NUMBERS:
-        signal.signal(number, lambda _number, _frame: stop.set())
-    return stop
-
-
 @contextmanager
 def stop_by_signal() -> Generator[threading.Event, None, None]:
-    """As `stop_on_signals`, for as long as the block runs."""
-    before = [signal.getsignal(number) for number in _NUMBERS]
+    """An event that Ctrl-C and a stop by the system set while the block runs."""
+    stop = threading.Event()
+    before = {
+        number: signal.signal(number, lambda _number, _frame: stop.set())
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
-        yield stop_on_signals()
+        yield stop
     finally:
-        for number, handler in zip(_NUMBERS, before, strict=True):
+        for number, handler in before.items():
             signal.signal(number, handler)

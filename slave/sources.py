@@ -6,18 +6,22 @@ its message; whatever else a driver raises is a fault in a program: counted, and
 """
 
 import logging
+import threading
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Protocol, TypeAlias, TypeVar
 
+import numpy as np
 from msgspec import Struct
 
-from common.arrays import Image
+from common.arrays import Float, Image
 from common.calibration import CameraCalibration
-from common.clock import now_ns
-from common.errors import PhalanxError
+from common.clock import Clock, now_ns
+from common.errors import ImuError, PhalanxError
 from common.messages import ImuSample, TrackerPose
 from common.recording.frame_recording import Illumination
+from slave.clocks import ClockSteppedError, DeviceClock
 
 ItemT_co = TypeVar("ItemT_co", covariant=True)
 
@@ -150,3 +154,52 @@ class Failures:
             return False
         self._logged_ns = t_ns
         return True
+
+
+NO_FIELD = np.full(3, np.nan)
+NO_ORIENTATION = np.full(4, np.nan)
+
+
+class ClockedImu(Reporting):
+    """What is alike in the drivers; `device` is called so in messages, `where` it is."""
+
+    def __init__(
+        self,
+        name: str,
+        device: str,
+        where: str,
+        clock: Clock,
+        stop: threading.Event,
+        device_clock: DeviceClock,
+    ) -> None:
+        self._name, self._device, self._where = name, device, where
+        self._clock, self._stop, self._device_clock = clock, stop, device_clock
+        self._counts: Counter[str] = Counter()
+        self._metrics: dict[str, float] = {}
+        self._seq, self._stamp_ns = -1, 0
+        self._closed = False
+
+    def counts(self) -> Mapping[str, int]:
+        """`broken` in all and by reason, and what else the driver counts."""
+        counts = dict(self._counts)
+        return {"broken": sum(v for k, v in counts.items() if k.startswith("broken.")), **counts}
+
+    def metrics(self) -> Mapping[str, float]:
+        """Return what the device last reported of itself, such as `temperature_c`."""
+        return dict(self._metrics)
+
+    def _possible(self, stamp_ns: int, arrival_ns: int) -> bool:
+        """Whether a stamp can be (counted if not); ImuError: the device began anew."""
+        try:
+            possible = self._device_clock.observe(stamp_ns, arrival_ns)
+        except ClockSteppedError:
+            raise ImuError(f"{self._where}: the {self._device} began anew, or its clock was set") from None
+        self._counts["broken.time"] += not possible
+        return possible
+
+    def _sample(self, stamp_ns: int, period_ns: float, gyro: Float, accel: Float, mag: Float) -> ImuSample:
+        """The sample of an observed stamp [ns], numbered by the time since the last."""
+        passed = max(1, round((stamp_ns - self._stamp_ns) / period_ns)) if self._seq >= 0 else 1
+        self._seq, self._stamp_ns = self._seq + passed, stamp_ns
+        t_ns = self._device_clock.at(stamp_ns)
+        return ImuSample(self._name, 0, self._seq, t_ns, gyro, accel, mag, NO_ORIENTATION)

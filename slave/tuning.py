@@ -210,14 +210,14 @@ class CameraTuning(Reporting):
 
     def _pick(self, body: str) -> dict[str, float]:
         with self._lock:
-            wish = parse(body.encode(), ColourPick, "pick")
+            request = parse(body.encode(), ColourPick, "pick")
             if self._sample is None:
                 raise CalibrationError(
                     "pick: this slave seeks no markers: the camera of a wrist device, or started with --colours none"
                 )
-            refuse_strange((wish.marker,), self._used.rig.markers, "pick: marker")
-            camera, report = self._sample(wish, self._used.camera)
-            self._apply(replace(self._used, camera=_with_provenance(camera, "pick", (wish.marker,))))
+            refuse_strange((request.marker,), self._used.rig.markers, "pick: marker")
+            camera, report = self._sample(request, self._used.camera)
+            self._apply(replace(self._used, camera=_with_provenance(camera, "pick", (request.marker,))))
         return self._settings("") | dict(report)
 
     def _load(self, body: str) -> dict[str, float]:
@@ -305,32 +305,23 @@ def _refuse_lost(old: CameraFiles, new: CameraFiles) -> None:
 
 
 def _refuse_restart(old: CameraFiles, new: CameraFiles) -> None:
-    for key in NEEDS_RESTART:
-        before, after = getattr(old.camera, key), getattr(new.camera, key)
+    camera, rig = f"camera {old.camera.name!r}", f"rig {new.rig.name!r}"
+    alone, all_of_rig = "it runs: restart the slave", f"it runs: {_ALL}"
+    fixed: list[tuple[str, str, object, object, str]] = [
+        (camera, key, getattr(old.camera, key), getattr(new.camera, key), alone) for key in NEEDS_RESTART
+    ]
+    if old.rig.kind == "wrist":
+        rates = old.camera.frame_rate_hz, new.camera.frame_rate_hz
+        fixed.append((camera, "frame_rate_hz", *rates, "laser and LEDs flash in its time: restart the slave"))
+    fixed.append((rig, "kind", old.rig.kind, new.rig.kind, all_of_rig))
+    if old.hand_path is not None:
+        fixed.append((rig, "hand", old.rig.hand, new.rig.hand, all_of_rig))
+    markers = ", ".join(old.rig.markers), ", ".join(new.rig.markers)
+    fixed.append((rig, "markers", *markers, all_of_rig))
+    for whose, key, before, after, why in fixed:
         if before != after:
-            raise CalibrationError(
-                f"camera {old.camera.name!r}: {key}: {before} cannot become {after} while it runs: restart the slave"
-            )
-    if old.rig.kind == "wrist" and old.camera.frame_rate_hz != new.camera.frame_rate_hz:
-        raise CalibrationError(
-            f"camera {old.camera.name!r}: frame_rate_hz: {old.camera.frame_rate_hz} cannot become "
-            f"{new.camera.frame_rate_hz} while laser and LEDs flash in its time: restart the slave"
-        )
-    if old.rig.kind != new.rig.kind:
-        raise CalibrationError(
-            f"rig {new.rig.name!r}: kind: {old.rig.kind} cannot become {new.rig.kind} while it runs: {_ALL}"
-        )
-    if old.hand_path is not None and old.rig.hand != new.rig.hand:
-        raise CalibrationError(
-            f"rig {new.rig.name!r}: hand: {old.rig.hand} cannot become {new.rig.hand} while it runs: {_ALL}"
-        )
+            raise CalibrationError(f"{whose}: {key}: {before} cannot become {after} while {why}")
     if old.rig.strobe != new.rig.strobe:
         raise CalibrationError(
-            f"rig {new.rig.name!r}: strobe: the limits of laser and LEDs cannot change while they are switched: restart"
-            " the slave"
-        )
-    if old.rig.markers != new.rig.markers:
-        raise CalibrationError(
-            f"rig {new.rig.name!r}: markers: {', '.join(old.rig.markers)} cannot become "
-            f"{', '.join(new.rig.markers)} while it runs: {_ALL}"
+            f"{rig}: strobe: the limits of laser and LEDs cannot change while they are switched: restart the slave"
         )

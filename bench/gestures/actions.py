@@ -22,7 +22,7 @@ from common.arrays import Bool, Float
 from common.calibration.gesture_settings import GestureSettings, default_gestures
 from common.geometry.transforms import matrix_to_quaternion
 from common.hand.model import CHAINS, FINGERS, TIPS, HandModel
-from common.hand.skin import TaperedCapsules, gaps_between
+from common.hand.skin import finger_segments, gaps_between
 from common.messages import Gesture, HandPose
 from common.sim.gestures import Annotation, Gestures
 from common.sim.motion import HandMotion
@@ -64,10 +64,8 @@ class GestureTruth:
         joints = model.forward(
             np.stack([state.T_rig_palm for state in states]), np.stack([state.angles_rad for state in states])
         ).position_m
-        capsules = TaperedCapsules.of_segments(joints, model.radius_m)
-        gap = gaps_between(
-            capsules.part(slice(0, 1), slice(2, 3)), capsules.part(slice(1, 5), slice(0, 3))
-        ).gap_m
+        capsules = finger_segments(joints, model.radius_m)
+        gap = gaps_between(capsules.of(slice(0, 1), slice(2, 3)), capsules.of(slice(1, 5), slice(0, 3))).gap_m
         seen = cls(motion, t, joints, gap[..., 2], gap.min(axis=-1), ())
         annotations = (seen._event(one, settings) for one in motion.annotations if one.stop_s < seconds - 1.0)
         return cls(

@@ -220,7 +220,7 @@ def _worn() -> RecognisedPoses:
     for number in range(1, _WRIST_PEOPLE + 1):
         with tempfile.TemporaryDirectory() as folder:
             done = performed(task, number, Path(folder))
-        poses = [done.poses.pose(k) for k in range(len(done.poses))]
+        poses = done.poses.messages()
         truth = [next((t.pose for t in done.held if t.from_ns <= p.t_ns <= t.to_ns), None) for p in poses]
         out.add(truth, recognised(poses, HandModel.of(done.hand)))
     return out

@@ -11,7 +11,7 @@ part of an error is FABRIK's and which is the palm's. `PointHand` is the estimat
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf
 
 import msgspec
@@ -27,9 +27,9 @@ from common.hand.profiles import ABDUCTION, FLEXION, generated_profile, preset_l
 from master.estimator.epoch import Epoch, Fitted, OrientationMeasurement
 from master.estimator.estimator import Estimator
 from master.estimator.settings import DEFAULT, Settings
-from master.fabrik.fabrik import Fabrik, Pose
+from master.fabrik.fabrik import Fabrik
 from master.fabrik.linear_algebra import Vector, as_vector
-from master.fabrik.solver import FingerSolver
+from master.fabrik.solver import Finger
 
 MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
 BACK = 5
@@ -156,9 +156,9 @@ Fingers = Callable[[Sequence[Vector]], Angles]  # five tips [m] in the palm fram
 INSIDE_RAD = 1e-6  # scipy refuses a start on a bound, and bounds that leave no room
 
 
-def finger_solvers(model: HandModel) -> list[FingerSolver]:
+def finger_solvers(model: HandModel) -> list[Finger]:
     """Return the closed form of the five fingers, each to its cap."""
-    return [FingerSolver.of(model, f, model.mount(name).offset_m) for f, name in enumerate(MARKERS[:5])]
+    return [Finger.of(model, f, model.mount(name).offset_m) for f, name in enumerate(MARKERS[:5])]
 
 
 def fixed_palm(model: HandModel, points_m: Float, rotation: Float = FACING_ROTATION) -> Float:
@@ -175,9 +175,9 @@ def tips_in_palm(T_rig_palm: Float, points_m: Float) -> list[Vector]:
 class PaperFingers:
     """Warm constrained FABRIK. Holds the last pose of each finger, from which the next search starts."""
 
-    closed: list[FingerSolver]
+    closed: list[Finger]
     fabrik: list[Fabrik] = field(init=False)
-    last: list[Pose | None] = field(init=False)
+    last: list[Float | None] = field(init=False)
 
     def __post_init__(self) -> None:
         self.fabrik = [Fabrik.of(solver.chain, restarts=0) for solver in self.closed]
@@ -189,18 +189,18 @@ class PaperFingers:
         for f, (fabrik, closed) in enumerate(zip(self.fabrik, self.closed, strict=True)):
             found = fabrik.solve(tips_m[f], self.last[f], closed.root)
             self.last[f] = found.angles
-            out.append([q for joint in found.angles for q in joint])
+            out.append(found.angles.tolist())
         return out
 
 
-def closed_form(solvers: Sequence[FingerSolver], tips_m: Sequence[Vector]) -> Angles:
+def closed_form(solvers: Sequence[Finger], tips_m: Sequence[Vector]) -> Angles:
     """Return angles (5, 4) [rad] for the five tips [m] in the palm frame, finger by finger."""
-    return [solver.solve(tip)[:4] for solver, tip in zip(solvers, tips_m, strict=True)]
+    return [solver.closed_form(tip)[:4] for solver, tip in zip(solvers, tips_m, strict=True)]
 
 
-def scipy_finger(solver: FingerSolver, target: Vector) -> list[float]:
+def scipy_finger(solver: Finger, target: Vector) -> list[float]:
     """Return angles (4,) [rad] of a finger whose cap is to be at `target` [m], from the middle of the limits."""
-    low, high = (np.array(v) for v in zip(*solver.limits, strict=True))
+    low, high = solver.chain.spans.T
     coupled = solver.chain.coupling is not None
     free = [k for k in range(4) if high[k] - low[k] > 2 * INSIDE_RAD and not (coupled and k == 3)]
     angles = np.clip(np.zeros(4), low, high)
@@ -239,7 +239,7 @@ class PointHand:
         settings: Settings = DEFAULT,
     ) -> None:
         """Prepare for `markers` in the order of the points; `faces`: a back that is seen looks to the cameras."""
-        settings = settings if faces else settings._replace(back_normal_rad=inf)
+        settings = settings if faces else replace(settings, back_normal_rad=inf)
         self.estimator = Estimator(
             [_NO_RAY], model, markers, markers, continuous=continuous, natural=natural, settings=settings
         )

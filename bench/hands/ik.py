@@ -29,7 +29,7 @@ from bench.report import Row, rms
 from common.hand.model import HandModel
 from master.fabrik.fabrik import Fabrik
 from master.fabrik.linear_algebra import Vector
-from master.fabrik.solver import Finger, FingerSolver
+from master.fabrik.solver import Finger
 
 CLOSED, WARM_STARTED, PAPER = "closed form", "FABRIK, seeded", "papers' way"
 _FROM_REST, _RESTARTED = "FABRIK, from rest", "FABRIK, from rest, restarts"
@@ -79,12 +79,12 @@ def _seeded(model: HandModel) -> Fingers:
     return way
 
 
-def _from_rest(fingers: Sequence[FingerSolver], restarts: int) -> Fingers:
+def _from_rest(fingers: Sequence[Finger], restarts: int) -> Fingers:
     prepared = [Fabrik.of(solver.chain, restarts=restarts) for solver in fingers]
 
     def way(tips: Sequence[Vector]) -> Angles:
         found = [f.solve(tip, None, one.root) for f, one, tip in zip(prepared, fingers, tips, strict=True)]
-        return [[q for joint in one.angles for q in joint] for one in found]
+        return [one.angles.tolist() for one in found]
 
     return way
 

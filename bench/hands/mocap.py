@@ -19,7 +19,8 @@ from common.geometry.transforms import matrix_to_rotation_vector, rigid, rotatio
 from common.hand.model import JOINTS
 from master.mocap.read import Reading
 from master.outputs.poses import PosesFile
-from master.recording.export.truth import Wanted, compare_source
+from master.recording.export.take import Window
+from master.recording.export.truth import compare_source
 
 CASES = (("standard", 7), ("standard", 23), ("grasp", 7), ("grasp", 22), ("both-travel", 21))
 """Scene and seed. Seeds above 20 were not looked at while it was decided which joints frame and clock are fitted by."""
@@ -53,7 +54,15 @@ def _compared_rows(scene: str, seed: int) -> Iterator[Row]:
         known, fitted = (
             cast(
                 dict[str, Any],
-                compare_source(source, one, Wanted(Reading(), aligned=aligned), lambda _line: None),
+                compare_source(
+                    source,
+                    one,
+                    Reading(),
+                    Window(),
+                    lambda _line: None,
+                    aligned=aligned,
+                    calibration=Path("calib_json"),
+                ),
             )
             for one, aligned in ((plain, True), (far, False))
         )

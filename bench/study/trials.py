@@ -33,7 +33,7 @@ from common.sim.wrist.scene import WristScene
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.subject import calibrate_subject
 from master.evaluation.wrist_score import WristTruth, at_rows, clear_line, load_wrist_truth, rows_at
-from master.outputs.poses import Poses, load_poses
+from master.outputs.poses import Poses
 from master.replay.offline import solve
 from master.replay.recorded import recorded_cycles
 from master.rig.setup import RigSetup
@@ -223,10 +223,10 @@ def performed(task: Task, number: int, folder: Path) -> Performed:
     _detect(trials, camera, rig, hand)
     recording = open_recording(trials)
     rig = rig if task.solver_mode is None else replace(rig, solver_mode=task.solver_mode)
-    solve(recording, RigSetup.of(rig, recording.manifest.cameras, HandModel.of(hand)), trials, trials)
+    solve(recording, [RigSetup.of(rig, recording.manifest.cameras, HandModel.of(hand))], trials, trials)
     truth = load_wrist_truth(recording, camera)
     assert truth is not None
-    return Performed(who.name, hand, held, load_poses(trials / "poses.npz"), truth, refused)
+    return Performed(who.name, hand, held, Poses.load(trials / "poses.npz"), truth, refused)
 
 
 def _known(task: Task, who: Participant, folder: Path) -> tuple[RigCalibration, HandProfile, bool]:

@@ -13,7 +13,7 @@ from bench.report import Row, datasets, rig_files, skipped
 from bench.wrist.frames import RECORDINGS
 from common.arrays import Image
 from common.recording.frame_recording import Illumination, open_recording
-from common.sim.wrist.record import ORDER, with_faults
+from common.sim.wrist.record import ORDER
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import AMBIENTS, WristScene
 from slave.sources import Frame
@@ -58,7 +58,7 @@ def deliver(count: int, seed: int, share: float = 0.05, *, hidden: bool = False)
     """
     rng = np.random.default_rng(seed)
     taken = range(int(rng.integers(3)), count)
-    order = with_faults(taken, rng, share, share, share)
+    order = _faulty(taken, rng, share)
     if hidden:
         return [Delivered(index, place) for place, index in enumerate(order)]
     places: list[int] = []
@@ -68,6 +68,25 @@ def deliver(count: int, seed: int, share: float = 0.05, *, hidden: bool = False)
         places.append(own + copies)
         last = own
     return [Delivered(index, place) for index, place in zip(order, places, strict=True)]
+
+
+def _faulty(frames: Sequence[int], rng: np.random.Generator, share: float) -> list[int]:
+    """Lose, double and delay a share of the frames each, as a faulty link does.
+
+    A frame suffers at most one of the three; the frame that another one was swapped with suffers none.
+    """
+    out: list[int] = []
+    held: list[int] = []
+    for frame, chance in zip(frames, rng.uniform(size=len(frames)).tolist(), strict=True):
+        if held:
+            out += [frame, held.pop()]
+        elif chance >= 3.0 * share:
+            out.append(frame)
+        elif chance >= 2.0 * share:
+            held.append(frame)
+        elif chance >= share:
+            out += [frame, frame]
+    return out + held
 
 
 def score(shown: Sequence[Shown], delivered: Sequence[Delivered], into: Score) -> Strobe:

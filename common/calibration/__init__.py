@@ -6,14 +6,16 @@ they are not SI; an unknown key is refused with file and key. docs/schema has th
 
 import inspect
 import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 from msgspec import Struct
 
 from common.calibration.camera import CameraCalibration, HsvRange, Intrinsics, RoiMargin, check_camera
 from common.calibration.files import (
+    UNIT_WITHIN,
     Matrix4,
     Positive,
     Provenance,
@@ -40,7 +42,6 @@ from common.calibration.hand import (
 from common.calibration.object_profile import ObjectProfile, check_object
 from common.calibration.output_settings import OutputSettings, check_outputs
 from common.calibration.rig import (
-    UNIT_WITHIN,
     AffineDisparityCalibration,
     FilterCalibration,
     ImuCalibration,
@@ -89,6 +90,14 @@ __all__ = [
 ]
 
 StructT = TypeVar("StructT", bound=Struct)
+_CHECKS: Mapping[type[Struct], Callable[[Any, str], None]] = {
+    RigCalibration: check_rig,
+    ObjectProfile: check_object,
+    GestureSettings: check_gestures,
+    OutputSettings: check_outputs,
+    CameraCalibration: check_camera,
+    HandProfile: check_hand,
+}
 
 
 def load(path: Path, kind: type[StructT]) -> StructT:
@@ -110,18 +119,8 @@ def parse(raw: bytes, kind: type[StructT], where: str) -> StructT:
 
 def check(value: Struct, where: str) -> None:
     """Refuse contradictions within a file: CalibrationError with `where` and the key."""
-    if isinstance(value, RigCalibration):
-        check_rig(value, where)
-    elif isinstance(value, ObjectProfile):
-        check_object(value, where)
-    elif isinstance(value, GestureSettings):
-        check_gestures(value, where)
-    elif isinstance(value, OutputSettings):
-        check_outputs(value, where)
-    elif isinstance(value, CameraCalibration):
-        check_camera(value, where)
-    elif isinstance(value, HandProfile):
-        check_hand(value, where)
+    if (check_own := _CHECKS.get(type(value))) is not None:
+        check_own(value, where)
 
 
 def save(path: Path, value: Struct) -> None:

@@ -7,6 +7,7 @@ first is looked for after it by a second, untyped pass, the second before it.
 
 import hashlib
 import json
+import math
 import os
 import re
 import tempfile
@@ -44,6 +45,15 @@ Direction = tuple[UnitComponent, UnitComponent, UnitComponent]
 Quaternion = tuple[UnitComponent, UnitComponent, UnitComponent, UnitComponent]
 Row4 = tuple[Coordinate, Coordinate, Coordinate, Coordinate]  # of a rotation, checked, and a translation [m]
 Matrix4 = tuple[Row4, Row4, Row4, Row4]
+
+
+UNIT_WITHIN = 1e-2  # of the length of a quaternion: what rounding leaves of one, and far from any mistake
+
+
+def check_quaternion(value: Quaternion, where: str) -> None:
+    """Refuse a quaternion that is not of length 1: CalibrationError with `where`."""
+    if abs((length := math.hypot(*value)) - 1.0) > UNIT_WITHIN:
+        raise CalibrationError(f"{where}: length {length:.4g}, a rotation is a quaternion wxyz of length 1")
 
 
 class Part(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=False):

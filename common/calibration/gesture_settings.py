@@ -22,6 +22,7 @@ from common.calibration.files import (
     Positive,
     Provenance,
 )
+from common.calibration.hand import Finger
 from common.errors import CalibrationError
 from common.messages import Name
 
@@ -165,7 +166,6 @@ Quantity = Literal[
     "index_ahead_deg", "fingers_bend_deg",
     "index_middle_spread_deg", "middle_ring_spread_deg", "ring_little_spread_deg",
 ]  # fmt: skip
-Finger = Literal["thumb", "index", "middle", "ring", "little"]
 Measured = Annotated[float, Meta(ge=-1e4, le=1e4)]  # degrees, mm, shares
 Border = Annotated[float, Meta(ge=1e-3, le=1e4)]
 Weight = Annotated[float, Meta(ge=1e-3, le=1e3)]

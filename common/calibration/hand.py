@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from common.calibration.files import Part, Provenance, Quaternion
+from common.calibration.files import Part, Provenance, Quaternion, check_quaternion
 from common.errors import CalibrationError
 from common.messages import MAX_MARKERS, Name
 
@@ -124,13 +124,7 @@ class HandProfile(Part, frozen=True):
 def check_hand(hand: HandProfile, where: str) -> None:
     """Refuse orientations that are no rotation and coinciding joints."""
     for name, joint in hand.rest_joints.items():
-        length = math.hypot(*joint.orientation_wxyz)
-        unit_within = 1e-2  # of the length of a quaternion: what rounding leaves of one
-        if abs(length - 1.0) > unit_within:
-            raise CalibrationError(
-                f"{where}: rest_joints.{name}.orientation_wxyz: length {length:.4g},"
-                " a rotation is a unit quaternion wxyz, of length 1"
-            )
+        check_quaternion(joint.orientation_wxyz, f"{where}: rest_joints.{name}.orientation_wxyz")
     for (one, a), (other, b) in combinations(hand.rest_joints.items(), 2):
         min_bone_m = 1e-3
         if math.dist(a.position_m, b.position_m) < min_bone_m:

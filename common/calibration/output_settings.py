@@ -4,13 +4,11 @@ Everything is off until somebody switches it on, and stays on this machine until
 gestures of a person are that person's. The defaults here are those of calib_json/outputs/default.json.
 """
 
-import math
 from typing import Annotated, Literal, TypeAlias
 
 from msgspec import Meta
 
-from common.calibration.files import Part, Quaternion
-from common.errors import CalibrationError
+from common.calibration.files import Part, Quaternion, check_quaternion
 from common.messages import Name
 
 Host = Annotated[str, Meta(min_length=1, max_length=255)]
@@ -96,9 +94,4 @@ def default_outputs(name: str = "default") -> OutputSettings:
 
 def check_outputs(settings: OutputSettings, where: str) -> None:
     """Refuse a quaternion that is not of length 1: CalibrationError with the key."""
-    length = math.hypot(*settings.vmc.q_avatar_rig)
-    unit_within = 1e-2  # of the length of a quaternion: what rounding leaves of one, and far from any mistake
-    if abs(length - 1.0) > unit_within:
-        raise CalibrationError(
-            f"{where}: vmc.q_avatar_rig: length {length:.4g}, a rotation is a quaternion wxyz of length 1"
-        )
+    check_quaternion(settings.vmc.q_avatar_rig, f"{where}: vmc.q_avatar_rig")

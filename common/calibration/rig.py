@@ -6,13 +6,14 @@ What belongs to a wrist device is in the frame of its camera (OpenCV axes).
 import math
 from collections.abc import Mapping
 from itertools import combinations
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from msgspec import Meta
 
 from common.arrays import Float
 from common.calibration.files import (
+    UNIT_WITHIN,
     Angle,
     Direction,
     Frequency,
@@ -25,7 +26,9 @@ from common.calibration.files import (
     Rate,
     StampOffset,
     Vector3,
+    check_quaternion,
 )
+from common.calibration.hand import Finger
 from common.calibration.object_profile import check_pose
 from common.calibration.strobe import StrobeCalibration, check_strobe
 from common.errors import CalibrationError
@@ -35,7 +38,6 @@ FLAT_FIELD_TERMS = (1, 3, 6, 10, 15, 21, 28)  # of polynomials in two variables,
 Reach = Annotated[float, Meta(ge=-1.0, le=1.0)]  # [m] the device sees the fingers of the hand that wears it
 Place = tuple[Reach, Reach, Reach]
 Coefficient = Annotated[float, Meta(ge=-1e6, le=1e6)]
-_FINGERS = ("thumb", "index", "middle", "ring", "little")
 
 
 class LaserPlane(Part, frozen=True):
@@ -96,9 +98,8 @@ def check_wrist(
             f"{where}: laser_plane.offset_m: {plane.offset_m:g}, the plane runs through the camera, which then sees no"
             f" depth on it; it is {min_offset_m:g} or more to either side"
         )
-    unit_within = 1e-2  # of the length of a direction: what rounding leaves of one
     for key, way in directions.items():
-        if way is not None and abs(math.hypot(*way) - 1.0) > unit_within:
+        if way is not None and abs(math.hypot(*way) - 1.0) > UNIT_WITHIN:
             raise CalibrationError(f"{where}: {key}: length {math.hypot(*way):.4g}, not 1")
         if way is None or plane is None or not key.startswith("laser."):
             continue
@@ -107,10 +108,11 @@ def check_wrist(
         if leaves > across:
             raise CalibrationError(f"{where}: {key}: leaves laser_plane by {leaves:.2f} of its length")
     for finger, line in lines.items():
-        if finger not in _FINGERS:
-            raise CalibrationError(f"{where}: finger_lines: {finger!r} is none of {', '.join(_FINGERS)}")
-        if abs(math.hypot(*line.direction) - 1.0) > unit_within:
-            length = math.hypot(*line.direction)
+        if finger not in get_args(Finger):
+            raise CalibrationError(
+                f"{where}: finger_lines: {finger!r} is none of {', '.join(get_args(Finger))}"
+            )
+        if abs((length := math.hypot(*line.direction)) - 1.0) > UNIT_WITHIN:
             raise CalibrationError(f"{where}: finger_lines.{finger}.direction: length {length:.4g}, not 1")
         if line.range_m[0] >= line.range_m[1]:
             raise CalibrationError(f"{where}: finger_lines.{finger}.range_m: must rise")
@@ -130,8 +132,6 @@ Markers = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MAX_MARKERS)
 # [m px] Baseline times focal length, from 0.1 mm and 10 px to 100 m and 1e7 px.
 DepthFactor = Annotated[float, Meta(ge=1e-3, le=1e9)]
 Drift = Annotated[float, Meta(ge=0.0, le=10.0)]  # [rad/s] far more than the bias of any gyroscope
-
-UNIT_WITHIN = 1e-2  # of the length of a quaternion: what rounding leaves of one, and far from any mistake
 
 
 class PowerLawCalibration(Part, frozen=True):
@@ -261,16 +261,12 @@ class RigCalibration(Part, frozen=True):
 
 def check_rig(rig: RigCalibration, where: str) -> None:
     """Refuse keys that contradict each other: CalibrationError with `where`, the key."""
-    if len(set(rig.cameras)) != len(rig.cameras):
-        raise CalibrationError(f"{where}: cameras: a name stands twice")
-    if len(set(rig.markers)) != len(rig.markers):
-        raise CalibrationError(f"{where}: markers: a name stands twice")
-    for name in rig.free_markers:
-        if name not in rig.markers:
-            raise CalibrationError(f"{where}: free_markers: {name!r} is not one of markers")
-    for name in rig.stamp_offset_us:
-        if name not in rig.cameras:
-            raise CalibrationError(f"{where}: stamp_offset_us: {name!r} is not one of cameras")
+    for key in ("cameras", "markers", "objects"):
+        if len(set(getattr(rig, key))) != len(getattr(rig, key)):
+            raise CalibrationError(f"{where}: {key}: a name stands twice")
+    for key, whole in (("free_markers", "markers"), ("stamp_offset_us", "cameras")):
+        if others := set(getattr(rig, key)) - set(getattr(rig, whole)):
+            raise CalibrationError(f"{where}: {key}: {min(others)!r} is not one of {whole}")
     if rig.volume is not None and any(
         a >= b for a, b in zip(rig.volume.low_m, rig.volume.high_m, strict=True)
     ):
@@ -291,8 +287,6 @@ def check_rig(rig: RigCalibration, where: str) -> None:
         return
     if len({rig.hand, *rig.other_hands}) != 1 + len(rig.other_hands):
         raise CalibrationError(f"{where}: other_hands: a hand stands twice")
-    if len(set(rig.objects)) != len(rig.objects):
-        raise CalibrationError(f"{where}: objects: a name stands twice")
     for key, pose in (("T_world_rig", rig.T_world_rig), ("T_rig_tracking", rig.T_rig_tracking)):
         if pose is not None:
             check_pose(np.array(pose), f"{where}: {key}")
@@ -327,10 +321,8 @@ def _check_imu(imu: ImuCalibration, cameras: tuple[str, ...], where: str) -> Non
             f"{where}: imu.name: {imu.name!r} is a camera; every sender has a name of its own"
         )
     for key, value in (("q_palm_imu", imu.q_palm_imu), ("q_rig_world", imu.q_rig_world)):
-        if value is not None and abs(math.hypot(*value) - 1.0) > UNIT_WITHIN:
-            raise CalibrationError(
-                f"{where}: imu.{key}: length {math.hypot(*value):.4g}, a rotation is a quaternion wxyz of length 1"
-            )
+        if value is not None:
+            check_quaternion(value, f"{where}: imu.{key}")
 
 
 def terms_of(xy: Float, degree: int) -> Float:

@@ -31,10 +31,20 @@ class Capsules:
     start_radius_m: Float
     stop_radius_m: Float
 
-    def of(self, bodies: slice) -> "Capsules":
-        """Some of them."""
+    def of(self, *at: int | slice | Int) -> "Capsules":
+        """Some of them, by indices into the last axes, such as (finger, segment)."""
+        end, radius = (..., *at, slice(None)), (..., *at)
         return Capsules(
-            self.start_m[bodies], self.stop_m[bodies], self.start_radius_m[bodies], self.stop_radius_m[bodies]
+            self.start_m[end], self.stop_m[end], self.start_radius_m[radius], self.stop_radius_m[radius]
+        )
+
+    def before(self, others: "Capsules") -> "Capsules":
+        """These and then others."""
+        return Capsules(
+            np.concatenate([self.start_m, others.start_m]),
+            np.concatenate([self.stop_m, others.stop_m]),
+            np.concatenate([self.start_radius_m, others.start_radius_m]),
+            np.concatenate([self.stop_radius_m, others.stop_radius_m]),
         )
 
     def normals(self, body: Int, points: Real) -> Real:

@@ -153,7 +153,6 @@ _LOG = logging.getLogger(__name__)
 _BENT = np.radians(5.0)  # a finger that never bends further has no plane
 _LEVEL = 0.5  # cosine of the flexion beyond which the heading of a finger is not observable
 _LEAST_SPREAD = np.radians(2.0)  # of a DIP about its share of the PIP: no hand is a gear
-_MARKERS = ("thumb", "index", "middle", "ring", "little")
 
 
 def profile_from_rest(
@@ -180,16 +179,17 @@ def profile_from_rest(
         raise CalibrationError(f"hand {name!r}: side {side!r}: left or right")
     to_palm = np.diag([-1.0, 1.0, -1.0])  # our palm frame has its z to the fingers
     place, rotated = position_m @ to_palm, to_palm @ rotation
-    joints: dict[str, RestJoint] = {}
-    for k, joint in enumerate(WEBXR_JOINTS):
-        joints[joint] = RestJoint(position_m=_vector(place[k]), orientation_wxyz=_quaternion(rotated[k]))
+    joints = {
+        joint: RestJoint(position_m=_vector(place[k]), orientation_wxyz=_quaternion(rotated[k]))
+        for k, joint in enumerate(WEBXR_JOINTS)
+    }
     knuckle, base = place[CHAINS[2, 0] - 1], place[METACARPALS[1] - 1]
     back_m = 0.012  # the skin of the back above the bones
     back = 0.5 * (knuckle + base) + [0.0, back_m, 0.0]
-    ends: list[int] = TIPS.tolist()
-    tips: dict[str, MarkerMount] = {}
-    for marker, tip in zip(_MARKERS, ends, strict=True):
-        tips[marker] = MarkerMount(joint=WEBXR_JOINTS[tip - 1], offset_m=(0.0, 0.0, 0.0))
+    tips = {
+        marker: MarkerMount(joint=JOINTS[int(tip)], offset_m=(0.0, 0.0, 0.0))
+        for marker, tip in zip(FINGERS, TIPS, strict=True)
+    }
     return HandProfile(
         version=1,
         name=name,
@@ -226,7 +226,7 @@ def profile_from_joints(
     for f, chain in enumerate(CHAINS):
         if np.linalg.norm(normals[:, f], axis=1).max() < 2.0 * np.sin(_BENT):
             raise CalibrationError(
-                f"hand {name!r}: the {_MARKERS[f]} never bends by 5 degrees, so its hinge is not known: record a fist"
+                f"hand {name!r}: the {FINGERS[f]} never bends by 5 degrees, so its hinge is not known: record a fist"
             )
         rest = (
             _finger_rest(bones[:, f], normals[:, f])
@@ -263,7 +263,7 @@ def _warn(model: HandModel, fingers_m: Float, angles: Float) -> None:
     aside = np.zeros(4)
     aside[opened] = np.nanmedian(azimuth[:, opened], axis=0) - np.arctan2(rest[:, 0], rest[:, 2])[opened]
     aside = np.degrees((aside + np.pi) % (2.0 * np.pi) - np.pi)
-    for f, finger in enumerate(_MARKERS):
+    for f, finger in enumerate(FINGERS):
         followed_m = 5e-3  # mean distance of recorded joints beyond which a finger is not followed
         if off[f] > followed_m:
             _LOG.warning(

@@ -312,8 +312,6 @@ def _rest(profile: HandProfile, where: str) -> tuple[Float, Float]:
         raise CalibrationError(f"{where}: rest_joints: unknown joint {min(unknown)!r}")
     position = np.array([joints[name].position_m for name in WEBXR_JOINTS])
     quaternion = np.array([joints[name].orientation_wxyz for name in WEBXR_JOINTS])
-    if (np.abs(np.linalg.norm(quaternion, axis=-1) - 1) > 1e-2).any():
-        raise CalibrationError(f"{where}: rest_joints: an orientation_wxyz is not a unit quaternion")
     rotation = quaternion_to_matrix(quaternion)
     middle = WEBXR_JOINTS.index("middle-finger-metacarpal")
     palm = position[[middle, middle + 1]].mean(axis=0)
@@ -328,8 +326,7 @@ def _radii(profile: HandProfile, where: str) -> Float:
     a, b = (
         np.array(joints[f"middle-finger-phalanx-{part}"].position_m) for part in ("proximal", "intermediate")
     )
-    length = float(np.linalg.norm(b - a))
-    given = profile.radius_m or {}
+    length, given = float(np.linalg.norm(b - a)), profile.radius_m or {}
     return np.array([given.get(name, length * radius_share(name)) for name in JOINTS])
 
 

@@ -17,6 +17,12 @@ _FLAT = ((10, 0, 0), (0, 0, 0), (0, 0, 0), (0, 0, 0), (0, 0, 0))
 _SPREAD = ((38, 0, 0), (12, 0, 0), (0, 0, 0), (-9, 0, 0), (-14, 0, 0))
 
 
+def smooth_step(x: float) -> float:
+    """Smooth step (C2): 0 below 0, 1 above 1, between 6x^5 - 15x^4 + 10x^3."""
+    x = min(max(x, 0.0), 1.0)
+    return x * x * x * (x * (6.0 * x - 15.0) + 10.0)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Move:
     """One way of the hand, or a rest.
@@ -47,8 +53,7 @@ class Move:
 
     def posture(self, share: float) -> Float:
         """Posture (5, 3) [deg] after `share` (0 ... 1) of its time, at rest at both ends."""
-        s = min(max(share, 0.0), 1.0)
-        return self.before + (self.after - self.before) * (s * s * s * (s * (6.0 * s - 15.0) + 10.0))
+        return self.before + (self.after - self.before) * smooth_step(share)
 
 
 @dataclass(frozen=True, slots=True)

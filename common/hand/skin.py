@@ -36,32 +36,10 @@ Foot: TypeAlias = tuple[Float, Float, Float, Float, Float, Float]
 ROUNDS = 12  # what is left then is below 0.1 mm, at worst where fingers are parallel
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TaperedCapsules:
-    """Cones of any leading shape.
-
-    Attributes:
-        start_m, along_m: (..., 3) [m] middle of the first ball, and from there to the last.
-        radius_m, growth_m: (...) [m] radius of the first ball, and by how much that of the last is larger.
-    """
-
-    start_m: Float
-    along_m: Float
-    radius_m: Float
-    growth_m: Float
-
-    @classmethod
-    def of_segments(cls, joints_m: Float, radius_m: Float) -> "TaperedCapsules":
-        """Segments (..., 5, 3), thumb ... little, of joints (..., 26, 3), radii (26,)."""
-        chain, radius = joints_m[..., CHAINS, :], radius_m[CHAINS]
-        return cls(chain[..., :-1, :], np.diff(chain, axis=-2), radius[..., :-1], np.diff(radius, axis=-1))
-
-    def part(self, *at: int | slice | None) -> "TaperedCapsules":
-        """Some of the segments: indices into the two last axes, (finger, segment)."""
-        where, place = (..., *at), (..., *at, slice(None))
-        return TaperedCapsules(
-            self.start_m[place], self.along_m[place], self.radius_m[where], self.growth_m[where]
-        )
+def finger_segments(joints_m: Float, radius_m: Float) -> Capsules:
+    """Segments (..., 5, 3), thumb ... little, of joints (..., 26, 3), radii (26,)."""
+    chain, radius = joints_m[..., CHAINS, :], radius_m[CHAINS]
+    return Capsules(chain[..., :-1, :], chain[..., 1:, :], radius[..., :-1], radius[..., 1:])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,27 +60,25 @@ class Gaps:
     a_to_b: Float
 
 
-def gaps_between(a: TaperedCapsules, b: TaperedCapsules) -> Gaps:
+def gaps_between(a: Capsules, b: Capsules) -> Gaps:
     """The gaps of cones against cones, broadcast against each other."""
-    apart = b.start_m - a.start_m
-    uu, vv = np.vecdot(a.along_m, a.along_m), np.vecdot(b.along_m, b.along_m)
-    uv, au, bv = (
-        np.vecdot(one, two) for one, two in ((a.along_m, b.along_m), (apart, a.along_m), (apart, b.along_m))
-    )
-    square = np.vecdot(apart, apart)
-    on_a = foot_of(au / uu, uv / uu, square / uu, 2.0 * bv / uu, vv / uu, a.growth_m, uu)
-    on_b = foot_of(-bv / vv, uv / vv, square / vv, -2.0 * au / vv, uu / vv, b.growth_m, vv)
+    apart, along_a, along_b = b.start_m - a.start_m, a.stop_m - a.start_m, b.stop_m - b.start_m
+    growth_a, growth_b = a.stop_radius_m - a.start_radius_m, b.stop_radius_m - b.start_radius_m
+    uu, vv, square = (np.vecdot(one, one) for one in (along_a, along_b, apart))
+    uv, au, bv = np.vecdot(along_a, along_b), np.vecdot(apart, along_a), np.vecdot(apart, along_b)
+    on_a = foot_of(au / uu, uv / uu, square / uu, 2.0 * bv / uu, vv / uu, growth_a, uu)
+    on_b = foot_of(-bv / vv, uv / vv, square / vv, -2.0 * au / vv, uu / vv, growth_b, vv)
     s = t = np.full(apart.shape[:-1], 0.5)
     for _ in range(ROUNDS):
         s, before = nearest(on_a, t), t
         t = nearest(on_b, s)
         if (t == before).all():  # as where the nearest are ends of bones: more rounds change nothing
             break
-    from_a = a.start_m + s[..., None] * a.along_m
-    between = b.start_m + t[..., None] * b.along_m - from_a
+    from_a = a.start_m + s[..., None] * along_a
+    between = b.start_m + t[..., None] * along_b - from_a
     length = np.sqrt(np.vecdot(between, between))
     way = between / np.maximum(length, 1e-9)[..., None]
-    radius_a, radius_b = a.radius_m + s * a.growth_m, b.radius_m + t * b.growth_m
+    radius_a, radius_b = a.start_radius_m + s * growth_a, b.start_radius_m + t * growth_b
     gap = length - radius_a - radius_b
     middle = from_a + (radius_a + 0.5 * gap)[..., None] * way
     return Gaps(gap, s, t, middle, way)

@@ -61,7 +61,11 @@ class WristDevice:
                 f"{where}: cameras: {', '.join(rig.cameras)}; the camera file is that of {camera.name!r}"
             )
         normal, offset_m = laser_plane_of(rig, where)
-        palm, optics = _palm(rig, where), CameraModel.of(camera, np.eye(4))
+        if rig.T_camera_palm is None:
+            raise CalibrationError(
+                f"{where}: T_camera_palm is missing, which `phalanx calibrate wrist palm` measures"
+            )
+        palm, optics = np.array(rig.T_camera_palm, dtype=np.float64), CameraModel.of(camera, np.eye(4))
         _check_before(optics, transform(palm, model.rest_position_m[CHAINS[1:, 0]]), where)
         return WristDevice(optics, model, palm, normal, offset_m)
 
@@ -109,24 +113,6 @@ def _check_before(optics: CameraModel, knuckles_m: Float, where: str) -> None:
             f"{where}: T_camera_palm: puts the knuckles of index ... little at {places} mm from the camera, where it"
             " does not see them"
         )
-
-
-def _palm(rig: RigCalibration, where: str) -> Float:
-    """`T_camera_palm` (4, 4) [m]."""
-    if rig.T_camera_palm is None:
-        raise CalibrationError(
-            f"{where}: T_camera_palm is missing, which `phalanx calibrate wrist palm` measures"
-        )
-    palm = np.array(rig.T_camera_palm, dtype=np.float64)
-    rotation = palm[:3, :3]
-    rotation_within = 1e-3  # of a rotation matrix: what rounding leaves of one
-    if (
-        not np.allclose(rotation @ rotation.T, np.eye(3), atol=rotation_within)
-        or np.linalg.det(rotation) < 0.0
-        or not np.array_equal(palm[3], [0.0, 0.0, 0.0, 1.0])
-    ):
-        raise CalibrationError(f"{where}: T_camera_palm: not a rotation and a shift, last row 0 0 0 1")
-    return palm
 
 
 STRAIGHT = np.zeros(2)

@@ -51,17 +51,8 @@ _WORDS = {
     QUATERNION: {"quat", "quaternion", "orientation", "q"},
 }
 _OTHERS = {
-    "bias",
-    "offset",
-    "std",
-    "cov",
-    "covariance",
-    "sigma",
-    "temp",
-    "temperature",
-    "euler",
-    "gravity",
-    "free",
+    *("bias", "offset", "std", "cov", "covariance", "sigma"),
+    *("temp", "temperature", "euler", "gravity", "free"),
 }
 _SPELT = {
     TIME: {"sec": "s", "secs": "s", "seconds": "s", "second": "s", "µs": "us", "μs": "us", "usec": "us", "msec": "ms",
@@ -128,11 +119,10 @@ def _meaning(name: str) -> tuple[str, str, str] | None:
     if words[-1] in "0123" and _WORDS[QUATERNION].intersection(words):
         words[-1] = "wxyz"[int(words[-1])]
     axis = next((word for word in reversed(words) if word in AXES[QUATERNION]), "")
-    rest = (
-        [word for k, word in enumerate(words) if k != len(words) - 1 - words[::-1].index(axis)]
-        if axis
-        else words
-    )
+    rest = list(reversed(words))
+    if axis:
+        rest.remove(axis)  # the last one
+    rest.reverse()
     for what, keywords in _WORDS.items():
         if axis in AXES[what] and any(
             word in keywords and (k == 0 or len(word) > 1) for k, word in enumerate(rest)

@@ -11,7 +11,7 @@ from common.errors import CalibrationError
 from common.messages import MAX_MARKERS, Name
 
 
-class PreviewWish(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
+class PreviewRequest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
     """Body of the command "preview"; an empty one asks for the plain picture.
 
     Attributes:
@@ -23,19 +23,19 @@ class PreviewWish(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True,
     found: bool = False
 
     @classmethod
-    def of(cls, body: str) -> "PreviewWish":
+    def of(cls, body: str) -> "PreviewRequest":
         """Read a body; raises CalibrationError, which names the key, if it is none."""
         return parse(body.encode(), cls, "preview") if body else cls()
 
     def body(self) -> str:
         """Return the command body that states this request."""
-        return "" if self == PreviewWish() else msgspec.json.encode(self).decode()
+        return "" if self == PreviewRequest() else msgspec.json.encode(self).decode()
 
 
 _PLAIN = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*")
 
 
-class RawWish(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
+class RawRequest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
     """Body of the command "raw".
 
     Attributes:
@@ -47,11 +47,11 @@ class RawWish(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omi
     lease_s: Annotated[float, Meta(ge=0.0, le=3600.0)] = 0.0
 
     @classmethod
-    def of(cls, body: str) -> "RawWish":
+    def of(cls, body: str) -> "RawRequest":
         """Read a body with a folder's name; CalibrationError names the key."""
-        wish = parse(body.encode(), cls, "raw")
-        refuse_strange(wish.name, "raw: name")
-        return wish
+        request = parse(body.encode(), cls, "raw")
+        refuse_strange(request.name, "raw: name")
+        return request
 
     def body(self) -> str:
         """Return the command body that states this request."""

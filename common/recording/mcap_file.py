@@ -160,10 +160,8 @@ def _unpacked(chunk: Chunk, budget: WorkBudget) -> bytes:
     size = zstandard.frame_content_size(chunk.data) if packed else len(chunk.data)
     if max(size, claimed) > BOUNDS.chunk_bytes:
         raise RecordingError(f"{max(size, claimed)} bytes unpacked, at most {BOUNDS.chunk_bytes}")
-    if size not in (
-        claimed,
-        -1,
-    ):  # -1: the frame does not state it, as of a writer that packs while it writes
+    # -1: the frame does not state it, as of a writer that packs while it writes
+    if size not in (claimed, -1):
         raise RecordingError(f"claims {claimed} bytes unpacked, its data {size}")
     budget.take(claimed)
     content = zstandard.decompress(chunk.data, max_output_size=claimed) if packed and claimed else chunk.data

@@ -19,7 +19,8 @@ from common.calibration import CameraCalibration, RigCalibration
 from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import invert
-from common.sim.light import LENS_SIGMA_PX, Float32, NoiseTiles, SrgbTables
+from common.sim.light import LENS_SIGMA_PX, Float32, NoiseTiles, encode
+from common.sim.scene import optics_of
 
 
 class BoardSettings(NamedTuple):
@@ -72,12 +73,11 @@ class BoardScene:
     rig: RigCalibration
     cameras: Mapping[str, CameraCalibration]
     seed: int
+    optics: Mapping[str, CameraModel] = field(init=False)
     poses: Float = field(init=False)
 
     def __post_init__(self) -> None:
-        for name in self.rig.cameras:
-            if name not in self.cameras:
-                raise CalibrationError(f"rig {self.rig.name!r}: cameras: no camera file for {name!r}")
+        object.__setattr__(self, "optics", optics_of(self.rig, self.cameras))
         object.__setattr__(self, "poses", self.find_poses())
 
     def find_poses(self) -> Float:
@@ -86,7 +86,7 @@ class BoardScene:
         Raises:
             CalibrationError: No pose was found that the rig's first camera sees whole: it looks past the volume.
         """
-        optics = [self.optics(name) for name in self.rig.cameras]
+        optics = list(self.optics.values())
         rng = np.random.default_rng([self.seed, 5])
         found: list[Float] = []
         for _ in range(200 * BOARD.poses):
@@ -109,20 +109,10 @@ class BoardScene:
         y, x = np.indices(((BOARD.rows + 1) * step, (BOARD.columns + 1) * step)) // step
         white, black, wall = 0.62, 0.035, 0.10  # linear light
         squares = np.where((x + y) % 2 == 0, black, white).astype(np.float32)
-        texture = cv2.copyMakeBorder(
-            squares, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=(white,)
-        )
+        texture = np.pad(squares, margin, constant_values=white)
         # Texel k covers k - 0.5 .. k + 0.5: the edge between two squares lies half a texel before the second.
         corner = np.full(2, margin + step - 0.5)
-        return Print(np.asarray(texture, np.float32), corner, wall, np.zeros(3), np.ones(3))
-
-    def optics(self, camera: str) -> CameraModel:
-        """One camera as geometry.
-
-        Raises:
-            CalibrationError: It has no intrinsics: a simulated camera must have a lens.
-        """
-        return CameraModel.of(self.cameras[camera], self.rig.camera_pose(camera))
+        return Print(texture, corner, wall, np.zeros(3), np.ones(3))
 
     def T_rig_board(self, t_s: float) -> Float:
         """Return the pose (4, 4) [m] at scene time `t_s` [s]; the poses repeat."""
@@ -146,8 +136,7 @@ class BoardRenderer:
     """
 
     def __init__(self, scene: BoardScene, camera: str) -> None:
-        """Prepare the ray of every fine pixel; CalibrationError: no such camera or lens."""
-        self._scene, self._optics = scene, scene.optics(camera)
+        self._scene, self._optics = scene, scene.optics[camera]
         height, width = self._optics.height_px, self._optics.width_px
         fine = (np.arange(BOARD.fine) + 0.5) / BOARD.fine - 0.5
         u = (np.arange(width)[:, None] + fine).ravel()
@@ -155,8 +144,7 @@ class BoardRenderer:
         uv = np.stack(np.meshgrid(u, v), axis=-1)
         self._xy = self._optics.undistort(uv).astype(np.float32)
         self._print = scene.printed()
-        self._noise = NoiseTiles.make(height, width, scene.seed * 64 + scene.rig.cameras.index(camera))
-        self._encode = SrgbTables.make()
+        self._noise = NoiseTiles(height, width, scene.seed * 64 + scene.rig.cameras.index(camera))
         self._gains_bgr = np.ones(3, dtype=np.float32)
         self._drawn: tuple[Float, Image] | None = None
 
@@ -185,25 +173,16 @@ class BoardRenderer:
         texels[:2] += self._print.origin[:, None] * texels[2]
         u, v = cv2.split(cv2.perspectiveTransform(self._xy, texels))
         shade = 0.55 + 0.45 * abs(float(T[2, 2]))
-        board: Float32 = np.asarray(
-            cv2.remap(
-                self._print.texture,
-                u,
-                v,
-                cv2.INTER_LINEAR,
-                borderMode=cv2.BORDER_CONSTANT,
-                borderValue=(0.0,),
-            ),
-            np.float32,
-        )
+        texture, border = self._print.texture, cv2.BORDER_CONSTANT
+        seen = cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=border, borderValue=(0.0,))
+        board: Float32 = np.asarray(seen, np.float32)
         fine = np.where(board > 0.0, board * np.float32(shade), np.float32(self._print.wall))
         size = (self._optics.width_px, self._optics.height_px)
-        light = cv2.GaussianBlur(
-            cv2.resize(fine, size, interpolation=cv2.INTER_AREA), (5, 5), 1.5 * LENS_SIGMA_PX
-        )
+        sharp = cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
+        light = cv2.GaussianBlur(sharp, (5, 5), 1.5 * LENS_SIGMA_PX)
         none = np.float32(self._print.none_bgr)
         colour = none + light[..., None] * (np.float32(self._print.all_bgr) - none)
-        return self._encode.encode(np.asarray(colour * self._gains_bgr, np.float32))
+        return encode(np.asarray(colour * self._gains_bgr, np.float32))
 
 
 def _before(camera: CameraModel, rng: np.random.Generator) -> Float:
@@ -222,10 +201,8 @@ def _before(camera: CameraModel, rng: np.random.Generator) -> Float:
 
 def _sees(camera: CameraModel, T: Float) -> bool:
     """Whether the board and half a square around it are in a camera's picture."""
-    rim = (
-        np.array([[-1, -1, 0], [BOARD.columns, -1, 0], [BOARD.columns, BOARD.rows, 0], [-1, BOARD.rows, 0]])
-        * BOARD.square_m
-    )
+    n, m = BOARD.columns, BOARD.rows
+    rim = np.array([[-1, -1, 0], [n, -1, 0], [n, m, 0], [-1, m, 0]]) * BOARD.square_m
     uv = camera.project(rim @ T[:3, :3].T + T[:3, 3])
     inside = (uv > 2.0) & (uv < np.array([camera.width_px, camera.height_px]) - 3.0)
     return bool(inside.all())

@@ -11,11 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float, Int
+from common.geometry.tapered_capsules import Capsules
 from common.hand.model import CHAINS, TIPS, HandModel
-from common.hand.skin import TaperedCapsules, gaps_between
-from common.sim.motion import POSES, angles_of
+from common.hand.skin import Gaps, finger_segments, gaps_between
+from common.sim.motion import POSES, angles_of, posture_of
 
-PAD_DEG = ((18, 8, 14), (2, 68, 34), (0, 68, 34), (-1, 68, 34), (-2, 68, 34))
+PAD_DEG = posture_of((18, 8, 14), (2, 68, 34), (0, 68, 34), (-1, 68, 34), (-2, 68, 34))
 # Thumb, then MCP and PIP of all fingers, from which a key is reached for.
 _REACH_DEG = (
     ((-10, 12, 30), (72, 36)),
@@ -23,7 +24,7 @@ _REACH_DEG = (
     ((-12, 35, 40), (78, 25)),
     ((-5, 42, 42), (80, 32)),
 )
-KNOB_DEG = ((26, 22, 18), (8, 38, 44), (2, 42, 46), (-6, 42, 46), (-12, 38, 44))
+KNOB_DEG = posture_of((26, 22, 18), (8, 38, 44), (2, 42, 46), (-6, 42, 46), (-12, 38, 44))
 PRESSED_M = 0.0005
 KNOB_M = (0.020, 0.026)  # radius of knobs
 
@@ -38,7 +39,6 @@ class Knob:
     posture_deg: Float
     centre_m: Float
     axis: Float
-    radius_m: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,14 +60,20 @@ class Posed:
     posture_deg: Float
     joints_m: Float
     rotation: Float
-    capsules: TaperedCapsules
+    capsules: Capsules
 
     @classmethod
     def of(cls, model: HandModel, posture_deg: Float, wobble: Float) -> "Posed":
         """Of postures (N, 5, 3) [deg] with the wobble (5, 4) of `angles_of`."""
         found = model.joints(np.eye(4), model.chains(angles_of(model, posture_deg, wobble)))
-        capsules = TaperedCapsules.of_segments(found.position_m, model.radius_m)
+        capsules = finger_segments(found.position_m, model.radius_m)
         return cls(posture_deg, found.position_m, found.rotation, capsules)
+
+    def thumb_gaps(self) -> Gaps:
+        """From the thumb's last segment to all of the fingers' (N, 4, 3)."""
+        return gaps_between(
+            self.capsules.of(slice(0, 1), slice(2, 3)), self.capsules.of(slice(1, 5), slice(None))
+        )
 
     def palmar(self, finger: int, segment: int) -> Float:
         """Unit vectors (N, 3) out of a segment's palmar side: -y of its first joint."""
@@ -76,23 +82,21 @@ class Posed:
 
 def pinch_posture(model: HandModel, finger: int, wobble: Float) -> Float:
     """Posture (5, 3) [deg] in which the pads of thumb and finger 1 ... 4 meet."""
-    start = np.array(POSES["pinch"], dtype=np.float64)
+    start = POSES["pinch"].copy()
     start[1:, 1:] = (12.0, 18.0)
     start[finger, 1:] = (46.0, 44.0)
-    others = [f for f in range(1, 5) if f != finger]
 
     def misses(posed: Posed) -> Float:
-        found = gaps_between(posed.capsules.part(slice(0, 1), 2), posed.capsules.part(slice(1, 5), 2))
+        found = gaps_between(posed.capsules.of(slice(0, 1), 2), posed.capsules.of(slice(1, 5), 2))
         way, gap = found.a_to_b[:, finger - 1], found.gap_m[:, finger - 1]
-        face = np.stack(
-            [1.0 - np.vecdot(way, posed.palmar(0, 2)), 1.0 + np.vecdot(way, posed.palmar(finger, 2))], axis=1
-        )
+        thumb, other = (np.vecdot(way, posed.palmar(f, 2)) for f in (0, finger))
+        face = np.stack([1.0 - thumb, 1.0 + other], axis=1)
         others_clear_m = 0.016
-        clear = np.maximum(others_clear_m - found.gap_m[:, [f - 1 for f in others]], 0.0)
+        clear = np.maximum(others_clear_m - np.delete(found.gap_m, finger - 1, axis=1), 0.0)
         return np.concatenate([(gap[:, None] + PRESSED_M) / 2e-4, face / 0.4, clear / 2e-3], axis=1)
 
     free = np.array([0, 1, 2, *range(3 * finger, 3 * finger + 3)])
-    return _solved(model, start, free, np.array([12.0, 12.0, 15.0, 5.0, 15.0, 15.0]), misses, wobble)[0]
+    return _solved(model, start, free, np.array([12.0, 12.0, 15.0, 5.0, 15.0, 15.0]), misses, wobble)
 
 
 def key_posture(model: HandModel, finger: int, segment: int, wobble: Float) -> Float:
@@ -104,36 +108,24 @@ def key_posture(model: HandModel, finger: int, segment: int, wobble: Float) -> F
     mine = slice(3 * (finger - 1), 3 * finger)
 
     def misses(posed: Posed) -> Float:
-        found = gaps_between(
-            posed.capsules.part(slice(0, 1), slice(2, 3)), posed.capsules.part(slice(1, 5), slice(0, 3))
-        )
+        found = posed.thumb_gaps()
         count = len(posed.joints_m)
         gap, way = found.gap_m.reshape(count, 12), found.a_to_b[:, finger - 1, segment]
         own = gap[:, mine][:, segment]
-        on = np.stack(
-            [found.on_b[:, finger - 1, segment] - 0.5, 0.5 * found.on_a[:, finger - 1, segment] - 0.5], axis=1
-        )
+        on_b, on_a = found.on_b[:, finger - 1, segment], found.on_a[:, finger - 1, segment]
+        on = np.stack([on_b - 0.5, 0.5 * on_a - 0.5], axis=1)
         side = 0.6 - np.maximum(-np.vecdot(way, posed.palmar(finger, segment)), -1.0)
-        others = np.delete(gap, range(3 * (finger - 1), 3 * finger), axis=1)
-        clear = np.maximum(0.004 - others, 0.0)
+        clear = np.maximum(0.004 - np.delete(gap, mine, axis=1), 0.0)
         posture = posed.posture_deg
         alike = (posture[:, 1:, 1:] - posture[:, 1:, 1:].mean(axis=1, keepdims=True)).reshape(count, -1)
-        return np.concatenate(
-            [
-                (own[:, None] + PRESSED_M) / 2e-4,
-                on / 0.12,
-                np.maximum(side, 0.0)[:, None] / 0.2,
-                clear / 1e-3,
-                alike / 7.0,
-            ],
-            axis=1,
-        )
+        skin, side = (own[:, None] + PRESSED_M) / 2e-4, np.maximum(side, 0.0)[:, None] / 0.2
+        return np.concatenate([skin, on / 0.12, side, clear / 1e-3, alike / 7.0], axis=1)
 
     free = np.array([0, 1, 2, *(3 * f + k for f in range(1, 5) for k in (1, 2))])
     width = np.array([25.0, 25.0, 25.0, *[25.0] * 8])
     starts = np.array([_pad(*start) for start in _REACH_DEG])
     nearest = np.square(misses(Posed.of(model, starts, wobble))).sum(axis=1).argmin()
-    return _solved(model, starts[nearest], free, width, misses, wobble)[0]
+    return _solved(model, starts[nearest], free, width, misses, wobble)
 
 
 def hover_posture(model: HandModel, key: Key, wobble: Float) -> Float:
@@ -145,7 +137,7 @@ def hover_posture(model: HandModel, key: Key, wobble: Float) -> Float:
     def misses(posed: Posed) -> Float:
         return (posed.joints_m[:, TIPS[0]] - target) / 2e-3
 
-    return _solved(model, key.posture_deg, np.arange(3), np.array([40.0, 40.0, 40.0]), misses, wobble)[0]
+    return _solved(model, key.posture_deg, np.arange(3), np.array([40.0, 40.0, 40.0]), misses, wobble)
 
 
 def pad_before(model: HandModel, hover_deg: Float, wobble: Float) -> Float:
@@ -156,17 +148,13 @@ def pad_before(model: HandModel, hover_deg: Float, wobble: Float) -> Float:
     for k, thumb in enumerate(aside):
         ways[k, :, 0] = (1.0 - share) * np.array(thumb) + share * hover_deg[0]
     posed = Posed.of(model, ways.reshape(-1, 5, 3), wobble)
-    thumb, fingers = (
-        posed.capsules.part(slice(0, 1), slice(2, 3)),
-        posed.capsules.part(slice(1, 5), slice(0, 3)),
-    )
-    nearest = gaps_between(thumb, fingers).gap_m.reshape(len(aside), -1).min(axis=1)
+    nearest = posed.thumb_gaps().gap_m.reshape(len(aside), -1).min(axis=1)
     return ways[int(nearest.argmax()), 0]
 
 
 def knob_grip(model: HandModel, radius_m: float, wobble: Float) -> Knob:
     """How five tips lie about a knob of that radius, in one plane across its axis."""
-    start = np.array(KNOB_DEG, dtype=np.float64)
+    start = KNOB_DEG
     reach_m = radius_m + model.radius_m[TIPS]
 
     def misses(posed: Posed) -> Float:
@@ -177,9 +165,9 @@ def knob_grip(model: HandModel, radius_m: float, wobble: Float) -> Knob:
         round_m = np.linalg.norm(off - along[..., None] * axis[:, None], axis=-1)
         return np.concatenate([(round_m - reach_m) / 5e-4, along / 1e-3], axis=1)
 
-    posture, _ = _solved(model, start, np.arange(15), np.tile([8.0, 15.0, 15.0], 5), misses, wobble)
+    posture = _solved(model, start, np.arange(15), np.tile([8.0, 15.0, 15.0], 5), misses, wobble)
     centre, axis = _middle_and_axis(Posed.of(model, posture[None], wobble).joints_m[:, TIPS])
-    return Knob(posture, centre[0], axis[0], radius_m)
+    return Knob(posture, centre[0], axis[0])
 
 
 def _middle_and_axis(tips_m: Float) -> tuple[Float, Float]:
@@ -199,8 +187,8 @@ def _solved(
     width_deg: Float,
     misses: Callable[[Posed], Float],
     wobble: Float,
-) -> tuple[Float, float]:
-    """Posture (5, 3) [deg] of least residual and deviation over width, and its cost."""
+) -> Float:
+    """Posture (5, 3) [deg] of least residual and deviation over width."""
 
     def residuals(x: Float) -> Float:
         posture = np.tile(start_deg.ravel(), (len(x), 1))
@@ -230,12 +218,12 @@ def _solved(
     posture[free] += best_x
     # `angles_of` holds a joint at its limit: a posture beyond it would be the same, but the way there has a kink.
     low, high = np.degrees(model.limits_rad[:, :3, 0]), np.degrees(model.limits_rad[:, :3, 1])
-    return np.clip(posture.reshape(5, 3), low, high), best
+    return np.clip(posture.reshape(5, 3), low, high)
 
 
 def _pad(thumb: tuple[float, float, float], bend: tuple[float, float]) -> Float:
     """Posture (5, 3) [deg] of a pad of fingers that are all bent like that."""
-    posture = np.array(PAD_DEG, dtype=np.float64)
+    posture = PAD_DEG.copy()
     posture[0], posture[1:, 1:] = thumb, bend
     return posture
 
@@ -251,9 +239,7 @@ def reachable_keys(model: HandModel, wobble: Float) -> tuple[Key, ...]:
         for segment in range(3):
             posture = key_posture(model, finger, segment, wobble)
             posed = Posed.of(model, posture[None], wobble)
-            found = gaps_between(
-                posed.capsules.part(slice(0, 1), slice(2, 3)), posed.capsules.part(slice(1, 5), slice(0, 3))
-            )
+            found = posed.thumb_gaps()
             gap, on = found.gap_m[0], float(found.on_b[0, finger - 1, segment])
             others = np.delete(gap, finger - 1, axis=0).min()
             touches = abs(float(gap[finger - 1, segment])) < 1e-3 and float(gap[finger - 1].min()) > -1.5e-3

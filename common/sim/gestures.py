@@ -30,7 +30,19 @@ from common.sim.gesture_postures import (
     pinch_posture,
     reachable_keys,
 )
-from common.sim.motion import FIST, POSES, REST, WAVE_CREST, Drift, HandState, Waves, angles_of, smooth_step
+from common.sim.motion import (
+    FIST,
+    PALM_TO_CAMERAS,
+    POSES,
+    REST,
+    WAVE_CREST,
+    DriftingMotion,
+    HandState,
+    Waves,
+    angles_of,
+    palm_pose,
+    smooth_step,
+)
 
 KEY_NAMES = (("3", "2", "1"), ("6", "5", "4"), ("9", "8", "7"), ("hash", "0", "star"))
 PERIOD_S = 75.0
@@ -86,24 +98,20 @@ class Track:
         return self._value[k - 1] + share * (self._value[k] - self._value[k - 1])
 
 
-class Gestures:
+class Gestures(DriftingMotion):
     """One round of gestures: its script and, in order, its annotations."""
 
     period_s = PERIOD_S
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
-        """Write the script of a hand whose open middle is at (3,) [m], rig frame."""
+        """Write the script, whose postures are solved (some tenths of a second)."""
         rng = np.random.default_rng([seed, 37])
-        self._model, self._centre, self._rng = model, np.asarray(centre_m, dtype=np.float64), rng
-        self._drift, self._sway = Drift(rng, PERIOD_S), Waves(rng, 2, PERIOD_S)
+        super().__init__(model, centre_m, rng, PERIOD_S)
+        self._rng, self._sway = rng, Waves(rng, 2, PERIOD_S)
         self._own = np.zeros((5, 4))  # how DIPs differ from their coupling while the hand is held
         self._own[:, 3] = rng.uniform(-0.5, 0.5, 5)
-        self._posture, self._steady = Track(np.array(REST)), Track(np.zeros(1))
-        self._place, self._rotation_vector, self._knob_angle = (
-            Track(np.zeros(6)),
-            Track(np.zeros(1)),
-            Track(np.zeros(1)),
-        )
+        self._posture, self._steady, self._place = Track(REST), Track(np.zeros(1)), Track(np.zeros(6))
+        self._rotation_vector, self._knob_angle = Track(np.zeros(1)), Track(np.zeros(1))
         # of its own, so that what the fingers do stays as it is
         self._ways = np.random.default_rng([seed, 41])
         self._shown = Track(np.array(_SHOWN_DEG["dial"][0]))
@@ -122,29 +130,18 @@ class Gestures:
         """Turn of all knobs until a time [s], clockwise from the back of the hand."""
         return float(self._knob_angle.at(max(t_s, 0.0) % PERIOD_S)[0])
 
-    def at(self, t_s: float) -> HandState:
-        """The hand at time `t_s` [s]; before 0 the pose of 0."""
-        t = max(t_s, 0.0) % PERIOD_S
-        wobble, shift, rotation_vector = self._drift.at(t)
-        steady = float(self._steady.at(t)[0])
+    def _moved(self, t: float, wobble: Float, shift: Float, rotation: Float) -> HandState:
+        steady, place = float(self._steady.at(t)[0]), self._place.at(t)
         angles = angles_of(self._model, self._posture.at(t), wobble + steady * (self._own - wobble))
-        place = self._place.at(t)
-        loose = 1.0 - steady
-        pose = self._pose(
-            np.radians(self._shown.at(t)), place[:3] + loose * shift, place[3:] + loose * rotation_vector
-        )
+        loose, (towards, rolled) = 1.0 - steady, np.radians(self._shown.at(t)).tolist()
+        shown = axis_rotation(0, towards) @ PALM_TO_CAMERAS @ axis_rotation(2, rolled)
+        turned = rotation_vector_to_matrix(place[3:] + loose * rotation) @ shown
+        pose = palm_pose(self._model, self._centre + (place[:3] + loose * shift), turned)
         knob = next((knob for start, knob in reversed(self._knobs) if t >= start), None)
         if knob is not None:
-            pose = pose @ _about(knob, float(self._rotation_vector.at(t)[0]))
+            about = rotation_vector_to_matrix(knob.axis * float(self._rotation_vector.at(t)[0]))
+            pose = pose @ rigid(about, knob.centre_m - about @ knob.centre_m)
         return HandState(pose, angles, np.radians(WRIST_DEG) * self._sway.at(t))
-
-    def _pose(self, shown_rad: Float, shift_m: Float, rotation_rad: Float) -> Float:
-        """`T_rig_palm` (4, 4): shown like that (2,), fingers up in the image."""
-        to_cameras = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-        shown = axis_rotation(0, float(shown_rad[0])) @ to_cameras @ axis_rotation(2, float(shown_rad[1]))
-        rotation = rotation_vector_to_matrix(rotation_rad) @ shown
-        middle = np.array([0.0, 0.0, 0.5 * float(self._model.rest_position_m[:, 2].max())])
-        return rigid(rotation, self._centre + shift_m - rotation @ middle)
 
     def _round(self, ways: dict[str, tuple[float, float]]) -> None:
         acts: dict[str, Callable[[], None]] = {
@@ -154,32 +151,21 @@ class Gestures:
             "taps": self._taps,
             "point": self._point,
         }
-        order = [tuple(acts)[k] for k in self._order(0, len(acts))]
-        for k, act in enumerate(order):
-            if k == 0:
-                self._show(ways[act], self._now - 0.6)
+        start = self._now - 0.6
+        for k in self._order(0, len(acts)):
+            act = tuple(acts)[k]
+            shown = np.array(ways[act]) + self._ways.uniform(-6.0, 6.0, 2)
+            self._shown.to(shown, start, self._now)  # while the hand moves freely
             acts[act]()
             start = self._now
             self._free()
-            if k + 1 < len(order):
-                self._show(ways[order[k + 1]], start)
-
-    def _show(self, way: tuple[float, float], start_s: float) -> None:
-        """Turn the hand to be shown that way, from then till now."""
-        shown = np.array(way) + self._ways.uniform(-6.0, 6.0, 2)
-        self._shown.to(shown, start_s, self._now)
 
     def _finish(self) -> None:
         """Back to how it began."""
         if self._now > PERIOD_S - 0.7:
             raise ValueError(f"the script lasts {self._now} s")
-        first = np.array(_SHOWN_DEG["dial"][0])
-        for track, value in (
-            (self._posture, np.array(REST)),
-            (self._place, np.zeros(6)),
-            (self._shown, first),
-        ):
-            track.to(value, self._now, self._now + 0.6)
+        for track in (self._posture, self._place, self._shown):
+            track.to(track.at(0.0), self._now, self._now + 0.6)
 
     def _go(self, posture: Float, seconds: float, rest_s: float, steady: float) -> None:
         """To a posture in so many seconds, and stay."""
@@ -189,7 +175,7 @@ class Gestures:
             self._steady.to(np.array([steady]), self._now, stop)
         self._now = stop + rest_s
 
-    def _record_begin(self, kind: GestureKind, name: str, start_s: float) -> None:
+    def _annotate(self, kind: GestureKind, name: str, start_s: float) -> None:
         self.annotations = (*self.annotations, Annotation(kind, name, start_s, self._now))
 
     def _order(self, first: int, end: int) -> list[int]:
@@ -200,13 +186,13 @@ class Gestures:
         return float(self._rng.uniform(low, high))
 
     def _pinches(self) -> None:
-        relaxed = np.array(REST) + np.array([[12.0, 4.0, 4.0], *[[0.0, 4.0, 6.0]] * 4])
+        relaxed = REST + np.array([[12.0, 4.0, 4.0], *[[0.0, 4.0, 6.0]] * 4])
         for finger in self._order(1, 5):
             start = self._now
             posture = pinch_posture(self._model, finger, self._own)
             self._go(posture, self._some(0.28, 0.5), self._some(0.25, 0.6), 1.0)
             self._go(relaxed, self._some(0.28, 0.45), self._some(0.1, 0.2), 0.0)
-            self._record_begin("pinch", FINGERS[finger], start)
+            self._annotate("pinch", FINGERS[finger], start)
 
     def _dial(self) -> None:
         knob, start = self._grip(), self._now
@@ -236,8 +222,8 @@ class Gestures:
     def _leave(self, knob: Knob, start_s: float) -> None:
         self._go(knob.posture_deg + 1.6 * _LOOSEN_DEG, 0.35, 0.0, 1.0)
         self._rotate_palm(0.0, 0.6)
-        self._go(np.array(REST), 0.4, 0.3, 0.0)
-        self._record_begin("dial", "dial", start_s)
+        self._go(REST, 0.4, 0.3, 0.0)
+        self._annotate("dial", "dial", start_s)
 
     def _rotate_palm(self, to_rad: float, seconds: float) -> None:
         self._rotation_vector.to(np.array([to_rad]), self._now, self._now + seconds)
@@ -263,39 +249,27 @@ class Gestures:
             start = self._now
             self._go(key.posture_deg, self._some(0.12, 0.18), self._some(0.04, 0.1), 1.0)
             self._go(hover, self._some(0.12, 0.18), self._some(0.1, 0.2), 1.0)
-            self._record_begin("tap", KEY_NAMES[key.finger - 1][key.segment], start)
+            self._annotate("tap", KEY_NAMES[key.finger - 1][key.segment], start)
         self._go(door, 0.25, 0.05, 1.0)
         self._go(aside, 0.25, 0.05, 1.0)
-        self._go(np.array(REST), 0.5, 0.1, 0.0)
+        self._go(REST, 0.5, 0.1, 0.0)
 
     def _point(self) -> None:
         start = self._now
-        rotation_vector = np.append(
-            np.zeros(3), np.radians([self._some(-10.0, 25.0), self._some(-15.0, 15.0), 0.0])
-        )
-        self._place.to(rotation_vector, self._now, self._now + 0.6)
-        self._go(np.array(POSES["pointing"]), self._some(0.4, 0.6), self._some(1.0, 1.4), 0.0)
-        self._go(np.array(REST), self._some(0.4, 0.6), 0.2, 0.0)
-        self._record_begin("point", "point", start)
+        rotation_deg = [self._some(-10.0, 25.0), self._some(-15.0, 15.0), 0.0]
+        self._place.to(np.append(np.zeros(3), np.radians(rotation_deg)), self._now, self._now + 0.6)
+        self._go(POSES["pointing"], self._some(0.4, 0.6), self._some(1.0, 1.4), 0.0)
+        self._go(REST, self._some(0.4, 0.6), 0.2, 0.0)
+        self._annotate("point", "point", start)
 
     def _free(self) -> None:
         """Fingers from posture to posture, the palm from place to place."""
         for _ in range(2):
             seconds = self._some(0.45, 0.7)
             rotation_deg = 14.0
-            place = np.concatenate(
-                [
-                    self._rng.uniform(-1.0, 1.0, 3) * REACH_M,
-                    np.radians(rotation_deg) * self._rng.uniform(-1.0, 1.0, 3),
-                ]
-            )
-            self._place.to(place, self._now, self._now + seconds)
-            self._go(np.array(_FREE[int(self._rng.integers(len(_FREE)))]), seconds, 0.05, 0.0)
+            shift = self._rng.uniform(-1.0, 1.0, 3) * REACH_M
+            rotation = np.radians(rotation_deg) * self._rng.uniform(-1.0, 1.0, 3)
+            self._place.to(np.append(shift, rotation), self._now, self._now + seconds)
+            self._go(_FREE[int(self._rng.integers(len(_FREE)))], seconds, 0.05, 0.0)
         self._place.to(self._place.last * 0.3, self._now, self._now + 0.4)
-        self._go(np.array(REST), 0.4, 0.05, 0.0)
-
-
-def _about(knob: Knob, angle_rad: float) -> Float:
-    """(4, 4) by which the palm goes on when the knob is turned, palm frame."""
-    rotation = rotation_vector_to_matrix(knob.axis * angle_rad)
-    return rigid(rotation, knob.centre_m - rotation @ knob.centre_m)
+        self._go(REST, 0.4, 0.05, 0.0)

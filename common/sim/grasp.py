@@ -24,11 +24,12 @@ from common.sim.motion import (
     PERIOD_S,
     REST,
     Cylinder,
-    Drift,
+    DriftingMotion,
     HandState,
     Waves,
     angles_of,
     base_pose,
+    posture_of,
     smooth_step,
     window,
 )
@@ -72,8 +73,7 @@ def closed_round(
     posture[..., 0] = SPREAD_DEG
     posture[:, 1:, 1], posture[..., 2] = _PIP_DEG[:, None] * mcp_per_pip, _PIP_DEG[:, None]
     air = gaps_m(model, angles_of(model, posture, wobble), T_palm_object, radius_m).min(axis=-1)
-    closed = np.zeros((5, 3))
-    closed[:, 0] = SPREAD_DEG
+    closed = posture[0].copy()
     for finger in range(1, 5):
         last = int(np.logical_and.accumulate(air[:, finger] >= 0.0).sum()) - 1
         before, after = air[max(last, 0), finger], air[min(last + 1, len(air) - 1), finger]
@@ -95,10 +95,8 @@ def _thumb(
     bones, girth = _phalanges(model, angles)
     to_bar = _clear_of(bones[:, 0], girth[:, 0], T_palm_object, radius_m).min(axis=(-1, -2))
     near = np.argsort(np.abs(to_bar))[:200]
-    own, own_girth = (
-        bones[near, 0, 1:].reshape(len(near), -1, 1, 3),
-        girth[near, 0, 1:].reshape(len(near), -1, 1),
-    )
+    own = bones[near, 0, 1:].reshape(len(near), -1, 1, 3)
+    own_girth = girth[near, 0, 1:].reshape(len(near), -1, 1)
     others, other_girth = bones[0, 1:].reshape(-1, 3), girth[0, 1:].ravel()
     to_fingers = (np.linalg.norm(own - others, axis=-1) - own_girth - other_girth).min(axis=(1, 2))
     touches_m, pressed_m, across_m = 0.0012, 0.0010, 0.012
@@ -150,24 +148,20 @@ COMES_M = np.array([0.015, 0.0, -0.13])  # from there, palm axes
 # of the whole hand: fingers and thumb a little away from the cameras
 LEAN_DEG = np.array([-26.0, -10.0, 0.0])
 SWAY_DEG, SWING_DEG = np.array([3.0, 3.0]), np.array([4.0, 5.0])  # flexion, deviation
-_OPEN = ((30, -8, 0), (3, 4, 5), (0, 4, 5), (-3, 4, 5), (-6, 4, 5))
+_OPEN = posture_of((30, -8, 0), (3, 4, 5), (0, 4, 5), (-3, 4, 5), (-6, 4, 5))
 
 
-class Grasp:
+class Grasp(DriftingMotion):
     """Five grasps in 60 s; `pace` (ROUNDS,) multiplies the times of each."""
 
-    period_s = PERIOD_S
-
     def __init__(self, model: HandModel, centre_m: Float, seed: int, radius_m: float = 0.012) -> None:
-        """Write the script about (3,) [m], rig frame, and close the hand (some 0.1 s)."""
+        """Write the script and close the hand (some 0.1 s)."""
         rng = np.random.default_rng([seed, 17])
-        self._model, self._radius_m = model, radius_m
-        self._drift, self._sway = Drift(rng), Waves(rng, 2)
+        super().__init__(model, centre_m, rng)
+        self._radius_m, self._sway = radius_m, Waves(rng, 2)
         up_m = 0.035  # of the bar above the middle of the view
-        place = rng.uniform(-1.0, 1.0, 3) * PLACE_M - np.array([0.0, up_m, 0.0])
-        self._centre = np.asarray(centre_m, dtype=np.float64) + place
-        self._rest = np.array(REST, dtype=np.float64) + rng.normal(0.0, (1.0, 2.0, 3.0), (5, 3))
-        self._open = np.array(_OPEN, dtype=np.float64)
+        self._centre = self._centre + (rng.uniform(-1.0, 1.0, 3) * PLACE_M - np.array([0.0, up_m, 0.0]))
+        self._rest = REST + rng.normal(0.0, (1.0, 2.0, 3.0), (5, 3))
         self._comes = COMES_M + rng.uniform(-0.01, 0.01, 3) * np.array([1.0, 0.0, 1.0])
         self.pace = rng.uniform(*PACE, ROUNDS)
         self._lift_m = rng.uniform(*LIFT_M, ROUNDS)
@@ -181,40 +175,34 @@ class Grasp:
         self._grip = closed_round(model, self._T_palm_object, radius_m, self._grip_wobble, mcp_per_pip)
         self._T_grip = base_pose(model, self._centre, np.zeros(3), self._lean)
 
-    def round_at(self, t_s: float) -> tuple[int, float]:
-        """Return the round at `t_s` [s], and the time in it [s] at a round's full length."""
-        t = max(t_s, 0.0) % PERIOD_S
-        k = min(int(t / ROUND_S), ROUNDS - 1)
-        return k, (t - k * ROUND_S) / float(self.pace[k])
-
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
-        k, s = self.round_at(t_s)
-        wobble, drift, drift_rotation = self._drift.at(max(t_s, 0.0) % PERIOD_S)
+        t = max(t_s, 0.0) % PERIOD_S
+        wobble, shift, rotation = self._drift_at(t)
+        k = min(int(t / ROUND_S), ROUNDS - 1)
+        s = (t - k * ROUND_S) / float(self.pace[k])  # at a round's full length
         near = _between(s, TIMING.leave_s, TIMING.arrive_s, TIMING.open_s, TIMING.back_s)
         ready = _between(s, TIMING.leave_s, TIMING.arrive_s - 0.5, TIMING.open_s + 0.3, TIMING.back_s)
         closed = _between(s, TIMING.arrive_s, TIMING.closed_s, TIMING.release_s, TIMING.open_s)
         lowered_s = 9.5
         lifted = _between(s, TIMING.lift_s, TIMING.lifted_s, TIMING.lower_s, lowered_s)
-        posture = self._rest + ready * (self._open - self._rest) + closed * (self._grip - self._open)
+        posture = self._rest + ready * (_OPEN - self._rest) + closed * (self._grip - _OPEN)
         angles = angles_of(self._model, posture, wobble + closed * (self._grip_wobble - wobble))
         still_s = 0.5  # in which the hand comes to stand still, and moves again
         still = window(s, TIMING.arrive_s - still_s, TIMING.lift_s + still_s, still_s)
         still += window(s, lowered_s - still_s, TIMING.open_s + still_s, still_s)
         side = np.array([self._model.side_sign, 1.0, 1.0])
-        shift = self._T_grip[:3, :3] @ ((1.0 - near) * side * self._comes)
-        shift = shift + (1.0 - still) * drift - lifted * np.array([0.0, self._lift_m[k], 0.0])
-        rotation, swing = self._rotation_and_swing(k, s)
-        pose = base_pose(
-            self._model, self._centre, shift, self._lean + rotation + (1.0 - still) * drift_rotation
-        )
+        comes = self._T_grip[:3, :3] @ ((1.0 - near) * side * self._comes)
+        place = comes + (1.0 - still) * shift - lifted * np.array([0.0, self._lift_m[k], 0.0])
+        swung, swing = self._rotation_and_swing(k, s)
+        turned = self._lean + swung + (1.0 - still) * rotation
+        pose = base_pose(self._model, self._centre, place, turned)
         held = TIMING.closed_s <= s < TIMING.release_s
         bar = (pose if held else self._T_grip) @ self._T_palm_object
-        flexed_deg = 3.0
+        flexed_deg, bar_length_m = 3.0, 0.18
         wrist_angles = np.radians(
             SWAY_DEG * self._sway.at(max(t_s, 0.0)) + swing + near * np.array([flexed_deg, 0.0])
         )
-        bar_length_m = 0.18
         return HandState(pose, angles, wrist_angles, (Cylinder(bar, self._radius_m, bar_length_m, held),))
 
     def _rotation_and_swing(self, k: int, s: float) -> tuple[Float, Float]:

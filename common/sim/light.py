@@ -23,7 +23,6 @@ from common.arrays import Float, Image
 from common.errors import CalibrationError, PhalanxError
 from common.geometry.camera_model import CameraModel
 from common.geometry.srgb import to_linear, to_srgb
-from common.geometry.transforms import transform
 
 Float32 = npt.NDArray[np.float32]
 
@@ -59,30 +58,21 @@ TO_LIGHT_RIG = np.array([-0.32, -0.45, -1.0]) / np.linalg.norm([-0.32, -0.45, -1
 _ENCODE_STEPS = 4096
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SrgbTables:
-    """sRGB curve: byte -> linear 0..1 (256,), and 4096 linear steps -> byte."""
+_LINEAR = to_linear(np.arange(256) / 255.0).astype(np.float32)  # byte -> light
+_BYTE = np.round(255.0 * to_srgb(np.arange(_ENCODE_STEPS) / (_ENCODE_STEPS - 1))).astype(np.uint8)  # and back
 
-    linear: Float32
-    byte: Image
 
-    @classmethod
-    def make(cls) -> "SrgbTables":
-        """Build both tables."""
-        linear = to_linear(np.arange(256) / 255.0).astype(np.float32)
-        steps = np.arange(_ENCODE_STEPS) / (_ENCODE_STEPS - 1)
-        return cls(linear, np.round(255.0 * to_srgb(steps)).astype(np.uint8))
+def decode(image: Image) -> Float32:
+    """Linear light (H, W, 3), 0..1, of sRGB bytes."""
+    return np.asarray(cv2.LUT(image, _LINEAR), dtype=np.float32).reshape(image.shape)
 
-    def decode(self, image: Image) -> Float32:
-        """Linear light (H, W, 3) of sRGB bytes."""
-        return np.asarray(cv2.LUT(image, self.linear), dtype=np.float32).reshape(image.shape)
 
-    def encode(self, light: Float32) -> Image:
-        """sRGB bytes of linear light (H, W, 3), clipped to 0..1."""
-        steps = light * np.float32(_ENCODE_STEPS - 1)
-        steps += np.float32(0.5)
-        np.clip(steps, 0, _ENCODE_STEPS - 1, out=steps)
-        return self.byte.take(steps.astype(np.intp))
+def encode(light: Float32) -> Image:
+    """sRGB bytes of linear light (H, W, 3), clipped to 0..1."""
+    steps = light * np.float32(_ENCODE_STEPS - 1)
+    steps += np.float32(0.5)
+    np.clip(steps, 0, _ENCODE_STEPS - 1, out=steps)
+    return _BYTE.take(steps.astype(np.intp))
 
 
 def bgr_bytes(linear_rgb: Float) -> tuple[int, int, int]:
@@ -182,52 +172,21 @@ class Light:
 
 @dataclass(frozen=True, slots=True)
 class LightSchedule:
-    """Schedule of a scene's light: knots (time [s], kelvin, exposure).
+    """Light of a scene over time: knots (time [s], kelvin, exposure), rising.
 
     Straight lines between knots; two at one time are a jump. Before the first and after the last nothing
     changes.
-
-    Attributes:
-        knots: In order of time.
-        calibrated_kelvin: The light under which the camera's white balance was set.
     """
 
     knots: tuple[tuple[float, float, float], ...]
-    calibrated_kelvin: float = CALIBRATED_KELVIN
-
-    def __post_init__(self) -> None:
-        times = [t for t, _, _ in self.knots]
-        if not self.knots or times != sorted(times):
-            raise PhalanxError(
-                f"light course: knots must be in order of time, at least one; got times {times}"
-            )
-        for _, kelvin, exposure in self.knots:
-            planckian_xy(kelvin)
-            if not exposure > 0.0:
-                raise PhalanxError(f"light course: exposure {exposure:g} must be above 0")
-        white_then = white(self.calibrated_kelvin)
-        if not (white_then > 0.0).all():
-            raise PhalanxError(
-                f"light course: calibrated_kelvin {self.calibrated_kelvin:g} has no blue at all"
-            )
 
     def at(self, t_s: float) -> Light:
         """The light at scene time `t_s` [s]; of a jump at that very time, the new light."""
-        times, kelvins, exposures = (list(column) for column in zip(*self.knots, strict=True))
-        after = int(np.searchsorted(times, t_s, side="right"))
-        if after == 0 or after == len(times):
-            i = max(after - 1, 0)
-            return Light(kelvins[i], exposures[i])
-        t0, t1 = times[after - 1], times[after]
-        share = (t_s - t0) / (t1 - t0)
-        return Light(
-            kelvins[after - 1] + share * (kelvins[after] - kelvins[after - 1]),
-            exposures[after - 1] + share * (exposures[after] - exposures[after - 1]),
-        )
-
-    def gains_bgr(self, t_s: float) -> Float:
-        """Factors (3,) of the channels at scene time `t_s` [s], blue first."""
-        return self.at(t_s).gains_bgr(self.calibrated_kelvin)
+        after = int(np.searchsorted([t for t, _, _ in self.knots], t_s, side="right"))
+        last = len(self.knots) - 1
+        (t0, *before), (t1, *then) = self.knots[max(after - 1, 0)], self.knots[min(after, last)]
+        share = (t_s - t0) / (t1 - t0) if 0 < after <= last else 0.0
+        return Light(*(a + share * (b - a) for a, b in zip(before, then, strict=True)))
 
 
 # One minute of a room: dusk under a lamp, then the lamp is dimmed, a cloud, noon; back at the end, so that it repeats.
@@ -256,7 +215,7 @@ def desk_image(optics: CameraModel, depth_m: float, seed: int) -> Image:
     v, u = np.mgrid[0:height, 0:width].astype(np.float64)
     rays = optics.ray(np.stack([u, v], axis=-1).reshape(-1, 2))
     along = (depth_m - optics.centre[2]) / np.where(rays[:, 2] > 0.05, rays[:, 2], 0.05)
-    points = transform(np.eye(4), optics.centre + along[:, None] * rays)
+    points = optics.centre + along[:, None] * rays
     texel_m = 0.001
     texel = (points[:, :2] / texel_m + SIDE / 2).reshape(height, width, 2).astype(np.float32)
     wear = cv2.remap(
@@ -290,35 +249,33 @@ def _wear(seed: int) -> npt.NDArray[np.float32]:
     return np.asarray(np.clip(wear, 0.5, 1.6, out=wear), dtype=np.float32)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+def tile_place(key: int) -> tuple[int, int, int]:
+    """Number and place (y, x) in the margin of a noise tile; one key, one place."""
+    mixed = (key * 2654435761 + 0x9E3779B9) & 0xFFFFFFFF  # Knuth's multiplicative hash
+    mixed = ((mixed ^ (mixed >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF
+    return mixed, mixed >> 4, mixed >> 14
+
+
 class NoiseTiles:
     """Sensor noise, drawn once: tiles (H + margin, W + margin, 3), plus and minus."""
 
-    plus: tuple[Image, ...]
-    minus: tuple[Image, ...]
-
-    @classmethod
-    def make(cls, height: int, width: int, seed: int, tiles: int = 2) -> "NoiseTiles":
-        """Draw the pool."""
+    def __init__(self, height: int, width: int, seed: int) -> None:
         rng = np.random.default_rng([seed, 2])
-        plus: list[Image] = []
-        minus: list[Image] = []
-        for _ in range(tiles):
+        self._tiles: list[tuple[Image, Image]] = []
+        for _ in range(2):
             white = rng.normal(0.0, 1.0, (height + NOISE_MARGIN, width + NOISE_MARGIN, 3))
             # A colour filter array mixes neighbours.
             mixed: Float = np.asarray(cv2.GaussianBlur(white, (3, 3), 0.45), dtype=np.float64)
             noise_sigma = 1.7  # in sRGB levels: gamma turns shot noise into a nearly constant amplitude
             level = np.rint(mixed * (noise_sigma * np.array([1.25, 0.85, 1.1]) / float(mixed.std())))
-            plus.append(np.clip(level, 0, 255).astype(np.uint8))
-            minus.append(np.clip(-level, 0, 255).astype(np.uint8))
-        return cls(tuple(plus), tuple(minus))
+            plus, minus = (np.clip(one, 0, 255).astype(np.uint8) for one in (level, -level))
+            self._tiles.append((plus, minus))
 
     def add_to(self, image: Image, key: int) -> None:
         """Add noise in place; the same key adds the same noise."""
         height, width = image.shape[:2]
-        mixed = (key * 2654435761 + 0x9E3779B9) & 0xFFFFFFFF  # Knuth's multiplicative hash
-        mixed = ((mixed ^ (mixed >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF
-        tile = mixed % len(self.plus)
-        y, x = (mixed >> 4) % NOISE_MARGIN, (mixed >> 14) % NOISE_MARGIN
-        cv2.add(image, self.plus[tile][y : y + height, x : x + width], dst=image)
-        cv2.subtract(image, self.minus[tile][y : y + height, x : x + width], dst=image)
+        number, y, x = tile_place(key)
+        y, x = y % NOISE_MARGIN, x % NOISE_MARGIN
+        plus, minus = (tile[y : y + height, x : x + width] for tile in self._tiles[number % 2])
+        cv2.add(image, plus, dst=image)
+        cv2.subtract(image, minus, dst=image)

@@ -1,12 +1,12 @@
-"""One image shows tracked objects: outlines, shading, depth, printed tags.
+"""Dark things and tracked objects in one image: outlines, shading, depth, tags.
 
 Key points in space (`Points`) become the outlines, shading and depth of each part in one camera's image. A tag is ink
 on paper in linear light, over a box of pixels, blurred by its motion.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import cache
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
 
 import cv2
 import numpy as np
@@ -14,14 +14,32 @@ import numpy as np
 from common.arrays import Float, Image
 from common.calibration.object_profile import TagFamily
 from common.geometry.tag_family import tag_image
-from common.geometry.transforms import cross
+from common.geometry.transforms import cross, transform
 from common.sim import light, raster
 from common.sim.light import AMBIENT, Float32
-from common.sim.raster import Shape
-from common.sim.surface import LAYER_SINES, rim, unit
+from common.sim.motion import Cylinder
+from common.sim.raster import Int32, Shape
+from common.sim.surface import LAYER_SINES, rim, tube_rims, unit
 from common.sim.tracked import BLOCK_FACES, PAPER_CELLS, Ball, Block, ObjectSurface, Rod, Sheet
 
 Colour = tuple[int, int, int]
+Project = Callable[[Float], Float]  # points (..., 3) [m], camera frame -> pixels (..., 2)
+_DARK = light.shades(light.THING_LINEAR_RGB)
+# of a flat face, by the cosine to the light, from 0 to 1
+_DARK_FACES = tuple(light.face_shade(light.THING_LINEAR_RGB, k / 64.0) for k in range(65))
+
+
+def depth_along(uv: Float, start_uv: Float, stop_uv: Float, start_m: Float, stop_m: Float) -> Float:
+    """Depth (...) [m] of lines between pixels (..., 2), where nearest to `uv`."""
+    share = _share(uv, start_uv, stop_uv)
+    return start_m * (1.0 - share) + stop_m * share
+
+
+def _share(uv: Float, start: Float, stop: Float) -> Float:
+    """Where (...) between `start` and `stop` (..., 2) pixels (..., 2) lie, 0 to 1."""
+    along = stop - start
+    square = np.maximum((along * along).sum(axis=-1), 1e-9)
+    return np.clip(((uv - start) * along).sum(axis=-1) / square, 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,17 +76,15 @@ class SeenBead:
 
     Attributes:
         at: (3,) its middle [m], camera frame.
-        bands: (LAYERS, N, 2) [px] its outline, then the parts on which the light falls more and more steeply.
-        shine_uv: (2,) [px] where the marker mirrors the lamp; shine_px: radius of that spot.
+        bands: (LAYERS, N, 2) the parts on which the light falls more and more steeply, then the spot where the
+            marker mirrors the lamp, in OpenCV's numbers (`raster.fixed`).
         t_s: The moment of its row [s], scene time.
     """
 
-    bead: Ball
+    marker: int
     at: Float
     part: SeenPart
-    bands: Float
-    shine_uv: Float
-    shine_px: float
+    bands: Int32
     t_s: float
 
     @property
@@ -118,73 +134,23 @@ class SeenSheet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenObjects:
-    """All tracked objects in one image, in the order of `ObjectSurface`.
+    """All tracked objects in one image, in the order of `ObjectSurface`."""
 
-    Attributes:
-        solid: The parts, and those of the beads: whatever may hide something. S of them.
-        low, high: (S, 2) [px] boxes about their outlines.
-        ends_uv, ends_depth: (S, 2, 2) [px], (S, 2) [m] as theirs.
-    """
+    parts: tuple[SeenPart, ...] = ()
+    beads: tuple[SeenBead, ...] = ()
+    sheets: tuple[SeenSheet, ...] = ()
 
-    parts: tuple[SeenPart, ...]
-    beads: tuple[SeenBead, ...]
-    sheets: tuple[SeenSheet, ...]
-    solid: tuple[SeenPart, ...]
-    low: Float
-    high: Float
-    ends_uv: Float
-    ends_depth: Float
-
-    @classmethod
-    def of(
-        cls, parts: Sequence[SeenPart], beads: Sequence[SeenBead], sheets: Sequence[SeenSheet]
-    ) -> "SeenObjects":
-        """Put them together."""
-        solid = (*parts, *(bead.part for bead in beads))
-        return cls(
-            tuple(parts),
-            tuple(beads),
-            tuple(sheets),
-            solid,
-            np.array([part.outline.min(axis=0) for part in solid]).reshape(-1, 2),
-            np.array([part.outline.max(axis=0) for part in solid]).reshape(-1, 2),
-            np.array([part.ends_uv for part in solid]).reshape(-1, 2, 2),
-            np.array([part.ends_depth for part in solid]).reshape(-1, 2),
-        )
-
-    def before(self, uv: Float, depth_m: float, low: Float, high: Float) -> list[SeenPart]:
-        """Parts nearer than a depth [m] at pixel (2,) that reach into a box (2,) [px].
-
-        The depth of a part is that of its axis where that passes nearest to the pixel.
-        """
-        if not self.solid:
-            return []
-        share = _share(uv, self.ends_uv[:, 0], self.ends_uv[:, 1])
-        depth = self.ends_depth[:, 0] * (1.0 - share) + self.ends_depth[:, 1] * share
-        chosen = (depth < depth_m) & raster.overlaps(self.low, self.high, low, high)
-        return [self.solid[k] for k in np.flatnonzero(chosen)]
+    @property
+    def solid(self) -> tuple[SeenPart, ...]:
+        """The parts, and those of the beads: whatever may hide something."""
+        return (*self.parts, *(bead.part for bead in self.beads))
 
     def outlines(self) -> list[Float]:
         """Everything that can be seen of them (N, 2) [px]."""
         return [
-            *(part.outline for part in self.parts),
-            *(bead.part.outline for bead in self.beads),
+            *(part.outline for part in self.solid),
             *(sheet.paper_uv for sheet in self.sheets if sheet.shows),
         ]
-
-
-def _share(uv: Float, start: Float, stop: Float) -> Float:
-    """Where (...) between `start` and `stop` (..., 2) pixels (..., 2) lie, 0 to 1."""
-    along = stop - start
-    return np.clip(
-        ((uv - start) * along).sum(axis=-1) / np.maximum((along * along).sum(axis=-1), 1e-9), 0.0, 1.0
-    )
-
-
-NOTHING = SeenObjects.of((), (), ())
-
-
-Project = Callable[[Float], Float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,91 +171,80 @@ class Appearances:
     circle: Float
     focal_px: float
     project: Project
-    thing: tuple[Colour, ...] = field(default_factory=lambda: light.shades(light.THING_LINEAR_RGB))
-    faces: tuple[Colour, ...] = field(
-        # by the cosine to the light, from 0 to 1
-        default_factory=lambda: tuple(light.face_shade(light.THING_LINEAR_RGB, k / 64.0) for k in range(65))
-    )
 
-    def seen(self, surface: ObjectSurface, points: Points) -> SeenObjects:
-        """What a camera sees of the objects whose key points are there."""
+    def thing(self, ends: Float, later: Float, later_s: float, radius_m: float) -> SeenPart:
+        """Picture of a cylinder with ends (2, 3) [m], `later_s` [s] on at `later`."""
+        ends_uv = self.project(ends)
+        velocity = (self.project(later) - ends_uv).mean(axis=0) / later_s
+        rims_uv = self.project(self._rims(ends, radius_m))
+        face = partial(light.face_shade, light.THING_LINEAR_RGB)
+        return self._cylinder(ends, rims_uv, ends_uv, np.stack([velocity, velocity]), face)
+
+    def objects(self, surface: ObjectSurface, points: Points) -> SeenObjects:
+        """What is seen of the objects whose key points are there."""
         if not surface.local.size:
-            return NOTHING
+            return SeenObjects()
         rods = [part for part in surface.parts if isinstance(part, Rod)]
         balls = [*(part for part in surface.parts if isinstance(part, Ball)), *surface.beads]
-        rod_rims, (edges, lit, shine) = self._rims(rods, points), self._ball_points(balls, points)
-        uv = project_all(self.project, (rod_rims, edges, lit, shine))
-        round_parts: dict[int, SeenPart] = {}
-        for k, rod in enumerate(rods):
-            round_parts[id(rod)] = self._rod(rod, uv[0][k], points)
-        bands = self._bands(balls, uv[1], uv[2], points)
+        rims = [self._rims(points.at[rod.ends], rod.radius_m) for rod in rods]
+        uv = project_all(self.project, (*rims, *(one for ball in balls for one in self._ball(ball, points))))
+        parts: dict[int, SeenPart] = {}
+        beads: list[SeenBead] = []
+        for rod, rims_uv in zip(rods, uv, strict=False):
+            ends = rod.ends
+            parts[id(rod)] = self._cylinder(
+                points.at[ends], rims_uv, points.uv[ends], points.speed_uv[ends], _dark_face
+            )
         for k, ball in enumerate(balls):
-            fills = () if ball.marker is not None else tuple(zip(bands[k], self.thing, strict=True))
+            edge_uv, lit_uv, shine_uv = uv[len(rods) + 3 * k :][:3]
+            size_px = self.focal_px * ball.radius_m / points.at[ball.middle, 2][0]
+            bands = lit_uv[:, None] + (size_px * LAYER_SINES)[:, None, None] * self.circle
+            bands[0] = edge_uv
             place = [ball.middle.start] * 2  # it has no ends, its middle stands for both
-            round_parts[id(ball)] = SeenPart(
-                uv[1][k], fills, points.uv[place], points.at[place, 2], points.speed_uv[place]
-            )
-        parts = [
-            self._block(part, points) if isinstance(part, Block) else round_parts[id(part)]
-            for part in surface.parts
-        ]
-        first = len(balls) - len(surface.beads)
-        beads = [
-            SeenBead(
-                bead,
-                points.at[bead.middle][0],
-                round_parts[id(bead)],
-                bands[first + k],
-                uv[3][first + k],
-                float(self.focal_px * bead.radius_m / points.at[bead.middle, 2][0]),
-                float(points.t_s[bead.middle][0]),
-            )
-            for k, bead in enumerate(surface.beads)
-        ]
-        return SeenObjects.of(parts, beads, [self._sheet(sheet, points) for sheet in surface.sheets])
+            fills = () if ball.marker is not None else tuple(zip(bands, _DARK, strict=True))
+            part = SeenPart(edge_uv, fills, points.uv[place], points.at[place, 2], points.speed_uv[place])
+            parts[id(ball)] = part
+            if ball.marker is not None:
+                shine_share = 0.15  # radius of the glossy spot, share of the bead's
+                bands = np.stack([*bands[1:], shine_uv + shine_share * size_px * self.circle])
+                at, t_s = points.at[place[0]], float(points.t_s[place[0]])
+                beads.append(SeenBead(ball.marker, at, part, raster.fixed(bands), t_s))
+        seen = (
+            self._block(one, points) if isinstance(one, Block) else parts[id(one)] for one in surface.parts
+        )
+        return SeenObjects(
+            tuple(seen), tuple(beads), tuple(self._sheet(sheet, points) for sheet in surface.sheets)
+        )
 
-    def _rims(self, rods: Sequence[Rod], points: Points) -> Float:
-        """Shading edges (R, 2, LAYERS, n, 3) [m] of rods; see `surface.tube_rims`."""
-        ends = np.array([points.at[rod.ends] for rod in rods]).reshape(-1, 2, 3)
-        radius = np.array([rod.radius_m for rod in rods])
-        axis = unit(ends[:, 1] - ends[:, 0])
-        across = self.to_light - (axis @ self.to_light)[:, None] * axis
-        middle = (radius[:, None] * light.LAYER_COSINES)[..., None] * across[:, None]
-        layers = np.broadcast_to(axis[:, None], middle.shape)
-        rims = middle[:, :, None] + rim(layers, radius[:, None] * LAYER_SINES, self.circle)
-        return ends[:, :, None, None] + rims[:, None]
+    def _rims(self, ends: Float, radius_m: float) -> Float:
+        """Shading edges (2, LAYERS, n, 3) [m] of a cylinder with ends (2, 3)."""
+        axis = unit(ends[1] - ends[0])
+        return np.stack([tube_rims(end, axis, radius_m, self.to_light, self.circle) for end in ends])
 
-    def _ball_points(self, balls: Sequence[Ball], points: Points) -> tuple[Float, Float, Float]:
-        """Edges (B, n, 3) [m], shading centres (B, LAYERS, 3), lamp's mirror (B, 3)."""
-        middle = np.array([points.at[ball.middle][0] for ball in balls]).reshape(-1, 3)
-        radius = np.array([ball.radius_m for ball in balls])
-        d2 = (middle * middle).sum(axis=1)
-        shrink = 1.0 - radius**2 / d2  # the circle in which the rays touch the ball
+    def _ball(self, ball: Ball, points: Points) -> tuple[Float, Float, Float]:
+        """Edge (n, 3) [m], shading centres (LAYERS, 3), where it mirrors the lamp (3,)."""
+        middle, radius = points.at[ball.middle.start], ball.radius_m
         towards = unit(middle)
-        edge = (middle * shrink[:, None])[:, None] + rim(towards, radius * np.sqrt(shrink), self.circle)
-        lit = middle[:, None] + (radius[:, None] * light.LAYER_COSINES)[..., None] * self.to_light
-        return edge, lit, middle + radius[:, None] * unit(self.to_light - towards)
+        shrink = 1.0 - radius**2 / (middle * middle).sum()  # the circle in which the rays touch the ball
+        edge = middle * shrink + rim(towards, np.asarray(radius * np.sqrt(shrink)), self.circle)
+        lit = middle + (radius * light.LAYER_COSINES)[:, None] * self.to_light
+        return edge, lit, middle + radius * unit(self.to_light - towards)
 
-    def _bands(self, balls: Sequence[Ball], edges_uv: Float, lit_uv: Float, points: Points) -> Float:
-        """Shading (B, LAYERS, n, 2) [px] of balls, the first their outlines."""
-        size = np.array([self.focal_px * ball.radius_m / points.at[ball.middle, 2][0] for ball in balls])
-        bands = lit_uv[:, :, None] + (size[:, None] * LAYER_SINES)[..., None, None] * self.circle
-        bands[:, 0] = edges_uv
-        return bands
-
-    def _rod(self, rod: Rod, rims_uv: Float, points: Points) -> SeenPart:
-        ends = points.at[rod.ends]
+    def _cylinder(
+        self,
+        ends: Float,
+        rims_uv: Float,
+        ends_uv: Float,
+        ends_speed: Float,
+        face_colour: Callable[[float], Colour],
+    ) -> SeenPart:
+        """A cylinder by its ends (2, 3) [m] and the edges of `_rims` [px]."""
         axis = unit(ends[1] - ends[0])
         layers = [raster.hull(rims_uv[:, k].reshape(-1, 2)) for k in range(rims_uv.shape[1])]
         front = 0 if float(axis @ ends[0]) > 0.0 else 1  # whose outward normal points to the camera
         cosine = float(axis @ self.to_light) * (1.0 if front else -1.0)
-        face = rims_uv[front, 0], self._face(cosine)
-        fills = (*zip(layers, self.thing, strict=True), face)
-        return SeenPart(layers[0], fills, points.uv[rod.ends], ends[:, 2], points.speed_uv[rod.ends])
-
-    def _face(self, cosine: float) -> Colour:
-        """Colour of a dark flat face whose normal has that cosine to the light."""
-        return self.faces[round(max(cosine, 0.0) * (len(self.faces) - 1))]
+        fills = (*zip(layers, _DARK, strict=True), (rims_uv[front, 0], face_colour(cosine)))
+        return SeenPart(layers[0], fills, ends_uv, ends[:, 2], ends_speed)
 
     def _block(self, block: Block, points: Points) -> SeenPart:
         corners, uv = points.at[block.corners], points.uv[block.corners]
@@ -297,7 +252,7 @@ class Appearances:
         normal = unit(cross(rings[:, 1] - rings[:, 0], rings[:, 3] - rings[:, 0]))
         out = normal * np.sign(np.vecdot(normal, rings.mean(axis=1) - middle))[:, None]
         fills = tuple(
-            (uv[list(face)], self._face(float(side @ self.to_light)))
+            (uv[list(face)], _dark_face(float(side @ self.to_light)))
             for face, side, corner in zip(BLOCK_FACES, out, rings[:, 0], strict=True)
             if float(side @ corner) < 0.0
         )
@@ -320,6 +275,18 @@ class Appearances:
             float(out @ self.to_light),
             float(points.t_s[sheet.corners].mean()),
         )
+
+
+def _dark_face(cosine: float) -> Colour:
+    """Colour of a dark flat face whose normal has that cosine to the light."""
+    return _DARK_FACES[round(max(cosine, 0.0) * (len(_DARK_FACES) - 1))]
+
+
+def ends_of(thing: Cylinder, T_camera_rig: Float) -> Float:
+    """Middles of both ends (2, 3) [m], camera frame."""
+    half = 0.5 * thing.length_m
+    own = np.array([[0.0, 0.0, -half], [0.0, 0.0, half]])
+    return transform(T_camera_rig, transform(thing.T_rig_object, own))
 
 
 def project_all(project: Project, parts: tuple[Float, ...]) -> list[Float]:

@@ -21,13 +21,12 @@ from common.geometry.transforms import (
     axis_rotation,
     matrix_to_quaternion,
     quaternion_to_matrix,
-    rigid,
     rotation_vector_to_matrix,
 )
 from common.hand.model import CHAINS, HandModel
 from common.hand.routine import MOVES, ROUTINE_S, STEPS, posture_at
 from common.recording.recorded_files import read_npz
-from common.sim.motion import Drift, HandState, angles_of, smooth_step
+from common.sim.motion import PALM_TO_CAMERAS, DriftingMotion, HandState, angles_of, palm_pose, smooth_step
 
 REACTION_S, TAIL_S = 1.0, 0.8
 PERIOD_S = REACTION_S + ROUTINE_S + TAIL_S
@@ -35,19 +34,18 @@ LATE_S = (0.05, 0.45)  # by how much a step is begun late, least and most
 REST = 0.1  # share of the drift of a hand in the air that is left when the palm rests on something
 
 
-class HandRoutine:
-    """One pass through the guided routine, and its script."""
+class HandRoutine(DriftingMotion):
+    """One pass through the guided routine.
+
+    `rest` is the share of the drift of a hand held in the air that the palm keeps.
+    """
 
     period_s = PERIOD_S
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int, rest: float = REST) -> None:
-        """Write the script of a hand whose open middle is at (3,) [m], rig frame.
-
-        `rest` is the share of the drift of a hand held in the air that the palm keeps.
-        """
         rng = np.random.default_rng([seed, 5])
-        self._model, self._centre, self._rest = model, np.asarray(centre_m, np.float64), rest
-        self._drift = Drift(rng)
+        super().__init__(model, centre_m, rng)
+        self._rest = rest
         starts = [next(m.start_s for m in MOVES if m.step == k) for k in range(len(STEPS))]
         late = rng.uniform(*LATE_S, len(STEPS))
         self._script_s = np.array([*starts, ROUTINE_S])
@@ -57,22 +55,12 @@ class HandRoutine:
         """Where in the routine [s] the hand is at time `t_s` [s]."""
         return float(np.interp(t_s, self._done_s, self._script_s))
 
-    def at(self, t_s: float) -> HandState:
-        """The hand at time `t_s` [s]; before 0 the pose of 0."""
-        t = max(t_s, 0.0) % PERIOD_S
-        wobble, shift, rotation = self._drift.at(t)
+    def _moved(self, t: float, wobble: Float, shift: Float, rotation: Float) -> HandState:
         angles = angles_of(self._model, posture_at(self.script_s(t)), wobble)
-        return HandState(self._pose(self._rest * shift, self._rest * rotation), angles)
-
-    def _pose(self, shift_m: Float, rotation_rad: Float) -> Float:
-        """`T_rig_palm` (4, 4): palm to the cameras, fingers up in the image."""
-        to_cameras = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
         tilt_deg = 15.0  # of the fingers towards the cameras
-        rotation = (
-            rotation_vector_to_matrix(rotation_rad) @ axis_rotation(0, np.radians(tilt_deg)) @ to_cameras
-        )
-        middle = np.array([0.0, 0.0, 0.5 * float(self._model.rest_position_m[:, 2].max())])
-        return rigid(rotation, self._centre + shift_m - rotation @ middle)
+        shown = axis_rotation(0, np.radians(tilt_deg)) @ PALM_TO_CAMERAS
+        rotated = rotation_vector_to_matrix(self._rest * rotation) @ shown
+        return HandState(palm_pose(self._model, self._centre + self._rest * shift, rotated), angles)
 
 
 KEYS = ("t", "hand0_joints", "hand0_palm", "hand0_normal", "hand0_direction", "hand0_type")
@@ -87,16 +75,15 @@ class LeapMotion:
 
     Attributes:
         centre_m: (3,) [m] middle of the volume, rig frame.
-        position_m: (N, 3) palm centre [m] around 0, rig axes; quaternion: (N, 4) wxyz; angles_rad: (N, 5, 4).
-        middle_m: (3,) the point of the palm frame that follows it, the middle of the flat hand.
+        position_m: (N, 3) middle of the flat hand [m] around 0, rig axes.
+        quaternion: (N, 4) wxyz; angles_rad: (N, 5, 4).
     """
 
+    model: HandModel
     centre_m: Float
     position_m: Float
     quaternion: Float
     angles_rad: Float
-    middle_m: Float
-    model: HandModel
 
     @property
     def period_s(self) -> float:
@@ -108,8 +95,8 @@ class LeapMotion:
         place = (max(t_s, 0.0) % self.period_s) / GRID_S
         angles = self.model.clamp(_hermite(self.angles_rad, place))
         rotation = quaternion_to_matrix(_hermite(self.quaternion, place))
-        centre = self.centre_m + _hermite(self.position_m, place)
-        return HandState(rigid(rotation, centre - rotation @ self.middle_m), angles)
+        middle = self.centre_m + _hermite(self.position_m, place)
+        return HandState(palm_pose(self.model, middle, rotation), angles)
 
 
 def load_leap(path: Path, model: HandModel, centre_m: Float) -> LeapMotion:
@@ -125,33 +112,29 @@ def load_leap(path: Path, model: HandModel, centre_m: Float) -> LeapMotion:
             f"{path}: no such recording; set PHALANX_DATASETS to the data folder (its leapjs/*.npz are needed)"
         )
     data = read_npz(path, KEYS, f"not a Leap recording with {', '.join(KEYS)}")
-    t = np.asarray(data["t"], dtype=np.float64)
-    joints, palm = (np.asarray(data[key], dtype=np.float64) for key in ("hand0_joints", "hand0_palm"))
-    normal, direction = (
-        np.asarray(data[key], dtype=np.float64) for key in ("hand0_normal", "hand0_direction")
-    )
+    t, joints, palm, normal, direction = (np.asarray(data[key], dtype=np.float64) for key in KEYS[:5])
     known = np.isfinite(joints[:, 1:]).all(axis=(1, 2)) & np.isfinite(palm).all(axis=1)
     if known.sum() < 4:
         raise RecordingError(f"{path}: fewer than four samples with a whole hand")
-    t, joints, palm, normal, direction = t[known], joints[known], palm[known], normal[known], direction[known]
-    if str(data["hand0_type"]) != model.profile.side:
-        mirror = np.array([-1.0, 1.0, 1.0])
-        joints, palm, normal, direction = joints * mirror, palm * mirror, normal * mirror, direction * mirror
-    rotation = palm_rotation(normal @ RIG_FROM_LEAP.T, direction @ RIG_FROM_LEAP.T)
-    angles = joint_angles(model, joints @ RIG_FROM_LEAP.T, rotation)
-    place = palm @ RIG_FROM_LEAP.T
-    place = REACH_M * np.tanh((place - np.median(place, axis=0)) / REACH_M)  # held inside the volume
+    t = t[known]
+    mirror = np.array([1.0 if str(data["hand0_type"]) == model.profile.side else -1.0, 1.0, 1.0])
+    joints, palm, normal, direction = (
+        (vectors[known] * mirror) @ RIG_FROM_LEAP.T for vectors in (joints, palm, normal, direction)
+    )
+    rotation = palm_rotation(normal, direction)
+    angles = joint_angles(model, joints, rotation)
+    place = REACH_M * np.tanh((palm - np.median(palm, axis=0)) / REACH_M)  # held inside the volume
     even = np.arange(t[0], t[-1], GRID_S)
     quaternion = _continuous(matrix_to_quaternion(rotation))
-    values = [_resample(even, t, v) for v in (place, quaternion, angles.reshape(-1, 20))]
-    place, quaternion, flat = (_close(value) for value in values)
+    place, quaternion, flat = (
+        _close(_resample(even, t, values)) for values in (place, quaternion, angles.reshape(-1, 20))
+    )
     return LeapMotion(
-        centre_m=np.asarray(centre_m, dtype=np.float64),
-        position_m=place,
-        quaternion=quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
-        angles_rad=flat.reshape(-1, 5, 4),
-        middle_m=np.array([0.0, 0.0, 0.5 * float(model.rest_position_m[:, 2].max())]),
-        model=model,
+        model,
+        np.asarray(centre_m, dtype=np.float64),
+        place,
+        quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
+        flat.reshape(-1, 5, 4),
     )
 
 
@@ -200,11 +183,9 @@ def _continuous(quaternion: Float) -> Float:
 
 def _resample(even: Float, t: Float, values: Float) -> Float:
     """Values (N, K) on the even grid, lightly smoothed (1 2 3 2 1)."""
-    columns: list[Float] = [
-        np.asarray(np.interp(even, t, values[:, k]), dtype=np.float64) for k in range(values.shape[1])
-    ]
-    rows = np.clip(np.arange(-2, len(even) + 2), 0, len(even) - 1)
-    padded = np.stack(columns, axis=1)[rows]
+    columns: list[Float] = [np.interp(even, t, column) for column in values.T]
+    resampled = np.stack(columns, axis=1)
+    padded = np.pad(resampled, ((2, 2), (0, 0)), mode="edge")
     smooth = np.zeros((len(even), values.shape[1]))
     for k, weight in enumerate((1, 2, 3, 2, 1)):
         smooth += weight / 9.0 * padded[k : k + len(even)]

@@ -6,13 +6,13 @@ Pixel (0, 0) is the centre of the top-left pixel, in OpenCV's drawing as everywh
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
-from math import ceil, floor, hypot
+from math import ceil, hypot
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from common.arrays import Bool, Float, Image, Int
+from common.arrays import Bool, Float, Image
 
 Int32 = npt.NDArray[np.int32]
 Float32 = npt.NDArray[np.float32]
@@ -115,12 +115,6 @@ def fixed(points: Float) -> Int32:
     return np.rint(points * (1 << FIXED_BITS)).astype(np.int32)
 
 
-def fixed_each(outlines: Sequence[Float]) -> list[Int32]:
-    """Each of some outlines (N, 2) as OpenCV's fixed-point numbers."""
-    corners = fixed(np.concatenate(outlines))
-    return [corners[a:b] for a, b in pairwise([0, *accumulate(map(len, outlines))])]
-
-
 def fill(image: Image, corners: Int32, colour: tuple[int, int, int]) -> None:
     """Fill a convex outline, smooth edges."""
     cv2.fillConvexPoly(image, corners, colour, lineType=cv2.LINE_AA, shift=FIXED_BITS)
@@ -131,70 +125,47 @@ def cover(markers: Sequence[Marker], exposure_s: float, size: tuple[int, int]) -
 
     `size` is width and height of the image [px]; what falls outside is not visible.
     """
-    if not markers:
-        return []
-    shapes = [shape for marker in markers for shape in marker.shapes]
+    return [_covered(marker, exposure_s, size) for marker in markers]
+
+
+def _covered(marker: Marker, exposure_s: float, size: tuple[int, int]) -> Coverage:
+    shapes, outline = marker.shapes, marker.outline
     counts = [len(shape.corners) for shape in shapes]
     starts = [0, *accumulate(counts)]
     owner = np.repeat(np.arange(len(shapes)), counts)
     corners = np.concatenate([shape.corners for shape in shapes])
-    inset = _inset(corners, np.add.reduceat(corners, starts[:-1]) / np.array(counts)[:, None], owner)
+    # Towards their shape's centre by what the fill adds.
+    spread = corners - (np.add.reduceat(corners, starts[:-1]) / np.array(counts)[:, None])[owner]
+    inset = HALF_SUBPIXEL_PX / np.maximum(np.hypot(spread[:, 0], spread[:, 1])[:, None], 1e-6)
+    inside = corners - spread * np.minimum(inset, 1.0)
+    offsets_s = moments(outline, exposure_s)
+    room_px = 2.0  # around what a marker covers
+    reach = offsets_s[-1] * np.abs(outline.velocity) + room_px
+    x0, y0 = np.floor(outline.corners.min(axis=0) - reach).astype(int).tolist()
+    x1, y1 = (np.ceil(outline.corners.max(axis=0) + reach).astype(int) + 1).tolist()
     scale = SUPER << FIXED_BITS
-    middle = (inset + (0.5 - 0.5 / SUPER)) * scale
     speed = np.array([shape.velocity for shape in shapes])[owner] * scale
-    low, high = (f.reduceat(corners, starts[:-1]) for f in (np.minimum, np.maximum))
-    found: list[Coverage] = []
-    first = 0
-    for marker in markers:
-        stop = first + len(marker.shapes)
-        offsets_s = moments(marker.outline, exposure_s)
-        room_px = 2.0  # around what a marker covers
-        reach = offsets_s[-1] * np.abs(marker.outline.velocity) + room_px
-        x0, y0 = map(floor, (low[first] - reach).tolist())
-        x1, y1 = (ceil(edge) + 1 for edge in (high[first] + reach).tolist())
-        own = slice(starts[first], starts[stop])
-        moved = middle[own] + offsets_s[:, None, None] * speed[own]
-        moved -= (x0 * scale, y0 * scale)
-        parts = [(a - own.start, b - own.start) for a, b in pairwise(starts[first : stop + 1])]
-        fine = np.rint(moved).astype(np.int32)
-        found.append(_covered(fine, parts, 1 if marker.cut is None else 2, (x0, y0, x1, y1), size))
-        first = stop
-    return found
-
-
-def _covered(
-    corners: Int32,
-    parts: Sequence[tuple[int, int]],
-    own_parts: int,
-    window: tuple[int, int, int, int],
-    size: tuple[int, int],
-) -> Coverage:
-    """Coverage of one marker.
-
-    Args:
-        corners: (n, N, 2) of all shapes at each moment, on the fine grid of the window.
-        parts: Where the corners of each shape begin and end: the marker, what it hides of itself, what hides
-            it.
-        own_parts: How many of them are the marker's own.
-        window: Pixels x0, y0, x1, y1.
-    """
-    x0, y0, x1, y1 = window
-    level = 255 // len(corners)
-    total: Image | None = None
-    own = 0
-    for moment in corners:
-        mask = np.zeros(((y1 - y0) * SUPER, (x1 - x0) * SUPER), dtype=np.uint8)
-        for k, (a, b) in enumerate(parts):
+    moved = (inside + (0.5 - 0.5 / SUPER)) * scale + offsets_s[:, None, None] * speed
+    moved -= (x0 * scale, y0 * scale)
+    level = 255 // len(moved)
+    total = np.zeros(((y1 - y0) * SUPER, (x1 - x0) * SUPER), dtype=np.uint8)
+    own, own_parts = 0, 1 if marker.cut is None else 2
+    for moment in np.rint(moved).astype(np.int32):
+        mask = np.zeros_like(total)
+        for k, (a, b) in enumerate(pairwise(starts)):
             cv2.fillConvexPoly(mask, moment[a:b], 0 if k else level, lineType=cv2.LINE_8, shift=FIXED_BITS)
             if k == own_parts - 1:
                 own += cv2.countNonZero(mask)
-        total = mask if total is None else np.asarray(cv2.add(total, mask, dst=total), dtype=np.uint8)
-    assert total is not None
-    _blank_outside(total, window, size)
-    seen = cv2.sumElems(total)[0] / level
-    fine = cv2.resize(total, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA)
-    alpha = fine * np.float32(1.0 / (level * len(corners)))
-    return Coverage(x0, y0, alpha, seen / own if own else 0.0)
+        cv2.add(total, mask, dst=total)
+    (width, height), seen = size, np.zeros_like(total)
+    rows, columns = (
+        slice(max(-first, 0) * SUPER, max(min(last, side) - first, 0) * SUPER)
+        for first, last, side in ((y0, y1, height), (x0, x1, width))
+    )
+    seen[rows, columns] = total[rows, columns]  # not what is outside of the image
+    fine = cv2.resize(seen, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA)
+    alpha = fine * np.float32(1.0 / (level * len(moved)))
+    return Coverage(x0, y0, alpha, cv2.sumElems(seen)[0] / level / own if own else 0.0)
 
 
 def moments(shape: Shape, exposure_s: float) -> Float:
@@ -219,25 +190,6 @@ def centroid(coverage: Coverage) -> Float:
 def _complex(points: Float) -> Complex:
     """Points (..., 2) of the plane as complex numbers (...)."""
     return np.ascontiguousarray(points).view(np.complex128)[..., 0]
-
-
-def _inset(corners: Float, middle: Float, owner: Int) -> Float:
-    """Move corners (N, 2) towards their shape's centre by what the fill adds."""
-    spread = corners - middle[owner]
-    reach = np.hypot(spread[:, 0], spread[:, 1])[:, None]
-    return corners - spread * np.minimum(HALF_SUBPIXEL_PX / np.maximum(reach, 1e-6), 1.0)
-
-
-def _blank_outside(mask: Image, window: tuple[int, int, int, int], size: tuple[int, int]) -> None:
-    (x0, y0, x1, y1), (width, height) = window, size
-    if x0 < 0:
-        mask[:, : -x0 * SUPER] = 0
-    if y0 < 0:
-        mask[: -y0 * SUPER] = 0
-    if x1 > width:
-        mask[:, max(width - x0, 0) * SUPER :] = 0
-    if y1 > height:
-        mask[max(height - y0, 0) * SUPER :] = 0
 
 
 def overlaps(low_a: Float, high_a: Float, low_b: Float, high_b: Float) -> Bool:

@@ -5,7 +5,6 @@ rendered recordings: truth.npz, truth_meta.json.
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,14 +47,12 @@ class RenderedFrame(NamedTuple):
     image: Image
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Row:
+class _Row(NamedTuple):
     """Truth of one row: views and times of row 0 [s], scene at the reference time."""
 
-    views: tuple[MarkerView, ...]
-    t_row0: tuple[float, ...]
+    views: list[MarkerView]
+    t_row0: list[float]
     reference: SceneTruth
-    wrist_angles_rad: Float
 
 
 class SceneTake:
@@ -68,7 +65,11 @@ class SceneTake:
     def __init__(self, scene: Scene, seconds: float, start_s: float = 0.0) -> None:
         """Prepare `seconds` [s] from `start_s` [s]; ValueError: frame rates differ."""
         self._scene, self._start_s = scene, start_s
-        names, self._period_s = scene.rig.cameras, _period_s(scene)
+        names = scene.rig.cameras
+        rates = {scene.cameras[name].frame_rate_hz for name in names}
+        if len(rates) != 1:
+            raise ValueError(f"frame_rate_hz of the cameras differ: {sorted(rates)}")
+        self._period_s = 1.0 / rates.pop()
         self.count = max(round(seconds / self._period_s), 1)
         self._renderers = [Renderer(scene, name) for name in names]
         self._offsets = [scene.timing(name).start_offset_ns * 1e-9 for name in names]
@@ -86,13 +87,12 @@ class SceneTake:
         scene = self._scene
         clicks: dict[str, dict[str, tuple[float, float]]] = {}
         for name, renderer, offset in zip(scene.rig.cameras, self._renderers, self._offsets, strict=True):
-            uv = renderer.observe(self._start_s + offset)[1].uv
-            seen = (
-                (marker, at)
-                for marker, at in zip(scene.rig.markers, uv, strict=True)
-                if np.isfinite(at).all()
-            )
-            clicks[name] = {marker: (float(at[0]), float(at[1])) for marker, at in seen}
+            uv = renderer.markers(self._start_s + offset).uv.tolist()
+            clicks[name] = {
+                marker: (u, v)
+                for marker, (u, v) in zip(scene.rig.markers, uv, strict=True)
+                if np.isfinite([u, v]).all()
+            }
         return Manifest(
             version=1,
             kind="markers",
@@ -108,33 +108,32 @@ class SceneTake:
         """All frames, row by row."""
         scene = self._scene
         for k in range(self.count):
-            times = tuple(self._start_s + k * self._period_s + offset for offset in self._offsets)
+            times = [self._start_s + k * self._period_s + offset for offset in self._offsets]
             views: list[MarkerView] = []
             for name, renderer, t in zip(scene.rig.cameras, self._renderers, times, strict=True):
                 image, view = renderer.observe(t)
                 views.append(view)
                 yield RenderedFrame(name, k, FIRST_NS + round(t * 1e9), Illumination.NONE, image)
-            at_s = times[0] + self._centre_s
-            self._rows.append(
-                _Row(tuple(views), times, scene.truth(at_s), scene.motion.at(at_s).wrist_angles_rad)
-            )
+            self._rows.append(_Row(views, times, scene.truth(times[0] + self._centre_s)))
 
     def truth(self) -> Arrays:
         """One row per frame of each camera."""
         rows, truths = self._rows, [row.reference for row in self._rows]
+        seen = {"uv": "uv", "frac": "visible", "px": "area", "t_cap": "t_s"}
         return {
-            "uv": np.array([[view.uv for view in row.views] for row in rows]),
-            "frac": np.array([[view.visible for view in row.views] for row in rows]),
-            "px": np.array([[view.area for view in row.views] for row in rows]),
-            "t_cap": np.array([[view.t_s for view in row.views] for row in rows]),
+            **{
+                key: np.array([[getattr(view, of) for view in row.views] for row in rows])
+                for key, of in seen.items()
+            },
             "t_row0": np.array([row.t_row0 for row in rows]),
             "t_ref": np.array([truth.t_s for truth in truths]),
             "paint_centroid": np.array([truth.markers_m for truth in truths]),
             "joints": np.array([truth.joints.position_m[1:] for truth in truths]),
             "angles": np.array([named_angles(self._scene.model, truth.angles_rad) for truth in truths]),
             "T_palm": np.array([truth.T_rig_palm for truth in truths]),
-            "flexion": np.array([row.wrist_angles_rad for row in rows]),
-        } | self._truth_of_objects()
+            "flexion": np.array([truth.wrist_angles_rad for truth in truths]),
+            **self._truth_of_objects(),
+        }
 
     def _truth_of_objects(self) -> Arrays:
         """Poses of each tracked object, what cameras saw of it, its tags' corners."""
@@ -156,14 +155,13 @@ class SceneTake:
             "joints": WEBXR_JOINTS,
             "angles": ANGLE_NAMES,
             "seed": scene.seed,
-            "paint_reflectance_linear_srgb": {name: marker_colour(name) for name in self._painted()},
+            "paint_reflectance_linear_srgb": {
+                name: marker_colour(name)
+                for m, name in enumerate(scene.rig.markers)
+                if name not in scene.rig.free_markers or m in scene.tracked.beads
+            },
             "objects": {name: scene.tracked.features(k) for k, name in enumerate(scene.rig.objects)},
         }
-
-    def _painted(self) -> tuple[str, ...]:
-        """Markers that are on a hand or on an object of this scene."""
-        rig, beads = self._scene.rig, self._scene.tracked.beads
-        return tuple(name for m, name in enumerate(rig.markers) if name not in rig.free_markers or m in beads)
 
 
 def record_scene(
@@ -224,14 +222,6 @@ def write_truth(folder: Path, truth: Arrays, meta: dict[str, object]) -> None:
         (folder / TRUTH_META).write_bytes(msgspec.json.format(msgspec.json.encode(meta), indent=1))
     except OSError as error:
         raise RecordingError(f"{folder}: cannot write: {error.strerror}") from error
-
-
-def _period_s(scene: Scene) -> float:
-    """From frame to frame of every camera [s]."""
-    rates = {scene.cameras[name].frame_rate_hz for name in scene.rig.cameras}
-    if len(rates) != 1:
-        raise ValueError(f"frame_rate_hz of the cameras differ: {sorted(rates)}")
-    return 1.0 / rates.pop()
 
 
 def named_angles(model: HandModel, angles_rad: Float) -> Float:

@@ -9,8 +9,8 @@ there stays as bright as a white marker in the new light, also where a real one 
 gain of the camera does the same (`Renderer.exposed`), and a longer exposure smears more.
 """
 
+from collections.abc import Iterable
 from copy import copy
-from math import ceil, floor
 
 import cv2
 import numpy as np
@@ -19,14 +19,12 @@ from common.arrays import Float, Image
 from common.geometry.srgb import gain_tables
 from common.sim import light, raster
 from common.sim.light import LENS_SIGMA_PX, NoiseTiles, desk_image
-from common.sim.objects_seen import SeenPart
-from common.sim.painter import Covered, MarkerView, Painter
+from common.sim.objects_seen import Colour, SeenPart
+from common.sim.painter import Box, MarkerView, Painted, Painter, around
 from common.sim.raster import Shape
 from common.sim.scene import DESK_DEPTH_M, Scene
-from common.sim.surface import CAPSULES, PALM_HULL, SeenThing
+from common.sim.surface import CAPSULES, PALM_HULL
 from common.sim.view import LAYERS, Snapshot, View
-
-Box = tuple[int, int, int, int]
 
 _PALM = list(PALM_HULL)
 ROOTS = (0, 3, 6, 9, 12)  # capsules that begin at the palm
@@ -42,11 +40,10 @@ class Renderer:
         place = scene.rig.cameras.index(camera)
         self._size = (optics.width_px, optics.height_px)
         self._desk = desk_image(optics, DESK_DEPTH_M, scene.seed)
-        self._noise = NoiseTiles.make(optics.height_px, optics.width_px, scene.seed * 64 + place)
+        self._noise = NoiseTiles(optics.height_px, optics.width_px, scene.seed * 64 + place)
         self._painter = Painter(self._view)
         self._skin = light.shades(light.SKIN_LINEAR_RGB, gloss=0.01)
         self._sleeve = light.shades(light.SLEEVE_LINEAR_RGB)
-        self._thing = light.shades(light.THING_LINEAR_RGB)
         self._light = scene.light
         self._gains_bgr = np.ones(3)
         self._card = light.face_shade(light.CARD_LINEAR_RGB, 0.8)
@@ -69,21 +66,17 @@ class Renderer:
         """Image (H, W, 3) BGR; row 0 is at mid-exposure at scene time `t_s` [s]."""
         return self._draw(t_s)[0]
 
-    def visible_fraction(self, t_s: float) -> Float:
-        """Visible share (M,) of every marker in that frame."""
-        return self.markers(t_s).visible
-
     def markers(self, t_s: float) -> MarkerView:
         """Truth of that frame, without the image."""
         snapshot = self._view.snapshot(t_s)
-        return self._painter.truth(self._painter.cover(snapshot, self._view.cards(snapshot)))
+        return self._painter.truth(self._painter.cover(snapshot, self._view.cards(snapshot)), snapshot)
 
     def observe(self, t_s: float) -> tuple[Image, MarkerView]:
         """Image and truth of one frame."""
-        image, painted = self._draw(t_s)
-        return image, self._painter.truth(painted)
+        image, painted, snapshot = self._draw(t_s)
+        return image, self._painter.truth(painted, snapshot)
 
-    def _draw(self, t_s: float) -> tuple[Image, Covered]:
+    def _draw(self, t_s: float) -> tuple[Image, list[Painted], Snapshot]:
         """Image of one frame, and what is painted in it."""
         snapshot = self._view.snapshot(t_s)
         cards = self._view.cards(snapshot)
@@ -92,7 +85,9 @@ class Renderer:
         self._draw_hand(image, snapshot)
         box = self._hand_box(snapshot, cards)
         self._smear(image, box, snapshot)
-        box = self._with_objects(box, snapshot)
+        if outlines := snapshot.tracked.outlines():
+            points = np.vstack(outlines)
+            box = around(box, self._box(points.min(axis=0) - 6.0, points.max(axis=0) + 6.0))
         for card in cards:
             raster.fill(image, raster.fixed(card.corners), self._card)
         windows = [self._painter.window(image, group, snapshot) for group in self._painter.clusters(painted)]
@@ -102,36 +97,38 @@ class Renderer:
             image[y : y + patch.shape[0], x : x + patch.shape[1]] = patch
         gains_bgr = self._gains_bgr
         if self._light is not None:
-            gains_bgr = gains_bgr * self._light.gains_bgr(max(t_s, 0.0) % self._view.scene.period_s)
+            gains_bgr = gains_bgr * self._light.at(max(t_s, 0.0) % self._view.scene.period_s).gains_bgr()
         if (gains_bgr != 1.0).any():
             image = np.asarray(cv2.LUT(image, gain_tables(gains_bgr).T[None]), dtype=np.uint8)
         self._noise.add_to(image, round(t_s * 1e6))
-        return image, painted
+        return image, painted, snapshot
 
     def _draw_hand(self, image: Image, snapshot: Snapshot) -> None:
         corners = raster.fixed(snapshot.outlines)
         depth = snapshot.points[:, 2]
         palm_depth = float(depth[_PALM].mean())
-        parts: list[tuple[float, tuple[int, ...] | SeenThing | SeenPart]] = [(palm_depth, ())]
-        parts += [(float(thing.ends_depth.mean()), thing) for thing in snapshot.things]
-        parts += [(float(part.ends_depth.mean()), part) for part in snapshot.tracked.parts]
+        parts: list[tuple[float, tuple[int, ...] | SeenPart]] = [(palm_depth, ())]
+        parts += [(float(one.ends_depth.mean()), one) for one in (*snapshot.things, *snapshot.tracked.parts)]
         phalanges = depth[CAPSULES].mean(axis=1).tolist()
         for part in _finger_parts(snapshot):
             # A part that grows out of the palm goes under its edge, wherever the rest of it is.
             margin = part[0] in ROOTS
             far = sum(phalanges[k] for k in part) / len(part)
             parts.append((max(far, palm_depth + 1e-6) if margin else far, part))
-        palm = list(zip(raster.fixed_each(snapshot.web), raster.fixed_each(snapshot.palm), strict=True))
-        behind = snapshot.into_sleeve
-        if behind:
-            self._draw_sleeve(image, snapshot)
+        palm = [
+            (raster.fixed(web), raster.fixed(hull))
+            for web, hull in zip(snapshot.web, snapshot.palm, strict=True)
+        ]
+        sleeve = list(zip(snapshot.sleeve, self._sleeve, strict=True))
+        if snapshot.into_sleeve:
+            _fill(image, sleeve)
         raster.fill(image, raster.fixed(snapshot.cuff_uv[0]), self._card)  # the dark inside of the sleeve
         for _, part in sorted(parts, key=lambda item: -item[0]):
-            if isinstance(part, SeenThing):
-                self._draw_thing(image, part)
-                continue
             if isinstance(part, SeenPart):
-                self._draw_part(image, part, snapshot)
+                if part in snapshot.things:
+                    _fill(image, part.fills)  # smeared later, with the hand
+                else:
+                    self._draw_part(image, part, snapshot)
                 continue
             for layer in range(LAYERS):
                 shapes = [corners[k, layer] for k in part] if part else [*palm[layer]]
@@ -140,14 +137,8 @@ class Renderer:
                     shapes += [corners[k, layer] for k in ROOTS]  # knuckles and thumb flow out of the palm
                 for shape in shapes:
                     raster.fill(image, shape, self._skin[layer])
-        if not behind:
-            self._draw_sleeve(image, snapshot)
-
-    def _draw_thing(self, image: Image, thing: SeenThing) -> None:
-        for outline, colour in zip(thing.layers, self._thing, strict=True):
-            raster.fill(image, raster.fixed(outline), colour)
-        face, cosine = thing.face
-        raster.fill(image, raster.fixed(face), light.face_shade(light.THING_LINEAR_RGB, cosine))
+        if not snapshot.into_sleeve:
+            _fill(image, sleeve)
 
     def _draw_part(self, image: Image, part: SeenPart, snapshot: Snapshot) -> None:
         """Draw an object's part, blurred by its motion beyond the hand's, which follows."""
@@ -163,48 +154,30 @@ class Renderer:
             return
         under = image[low[1] : high[1], low[0] : high[0]]
         if len(moments) == 1:
-            for outline, colour in part.fills:
-                raster.fill(under, raster.fixed(outline - low), colour)
+            _fill(under, ((outline - low, colour) for outline, colour in part.fills))
             return
         fills = [(outline - low, part.speed(outline), colour) for outline, colour in part.fills]
         total = np.zeros(under.shape, np.float32)
         for moment in moments:
             drawn = under.copy()
-            for corners, speed_uv, colour in fills:
-                raster.fill(drawn, raster.fixed(corners + moment * speed_uv), colour)
+            _fill(drawn, ((corners + moment * speed_uv, colour) for corners, speed_uv, colour in fills))
             cv2.accumulate(drawn, total)
         under[:] = np.rint(total / len(moments))
 
-    def _draw_sleeve(self, image: Image, snapshot: Snapshot) -> None:
-        for outline, colour in zip(raster.fixed_each(snapshot.sleeve), self._sleeve, strict=True):
-            raster.fill(image, outline, colour)
+    def _box(self, low: Float, high: Float) -> Box:
+        """Box of pixels about (2,) ... (2,) [px], inside the image."""
+        size = np.array(self._size)
+        x0, y0 = np.clip(np.floor(low), 0, size - 1).astype(int).tolist()
+        x1, y1 = np.clip(np.ceil(high), 1, size).astype(int).tolist()
+        return x0, y0, x1, y1
 
     def _hand_box(self, snapshot: Snapshot, cards: tuple[Shape, ...]) -> Box:
-        """Box x0, y0, x1, y1 [px] of all that is drawn, inside the image."""
-        spread = snapshot.discs_px[:, 0, None] + 6.0
-        low, high = (
-            (snapshot.discs_uv[:, 0] - spread).min(axis=0),
-            (snapshot.discs_uv[:, 0] + spread).max(axis=0),
-        )
-        for outline in (*(c.corners for c in cards), *(thing.layers[0] for thing in snapshot.things)):
-            low, high = np.minimum(low, outline.min(axis=0)), np.maximum(high, outline.max(axis=0))
-        (x0, y0), (x1, y1), (width, height) = low.tolist(), high.tolist(), self._size
-        x0, y0 = min(max(floor(x0), 0), width - 1), min(max(floor(y0), 0), height - 1)
-        return x0, y0, max(min(ceil(x1), width), x0 + 1), max(min(ceil(y1), height), y0 + 1)
-
-    def _with_objects(self, box: Box, snapshot: Snapshot) -> Box:
-        """The box and all that is drawn of tracked objects."""
-        outlines = snapshot.tracked.outlines()
-        if not outlines:
-            return box
-        points = np.vstack(outlines)
-        low = np.clip(np.floor(points.min(axis=0) - 6.0), 0, np.array(self._size) - 1).astype(int)
-        high = np.clip(np.ceil(points.max(axis=0) + 6.0), 1, self._size).astype(int)
-        return (
-            min(box[0], int(low[0])),
-            min(box[1], int(low[1])),
-            max(box[2], int(high[0])),
-            max(box[3], int(high[1])),
+        """Box of the hand, of cards and things."""
+        spread, discs = snapshot.discs_px[:, 0, None] + 6.0, snapshot.discs_uv[:, 0]
+        outlines = (*(card.corners for card in cards), *(thing.outline for thing in snapshot.things))
+        return self._box(
+            np.vstack([discs - spread, *outlines]).min(axis=0),
+            np.vstack([discs + spread, *outlines]).max(axis=0),
         )
 
     def _way(self, snapshot: Snapshot) -> Float:
@@ -223,15 +196,13 @@ class Renderer:
             height, width = roi.shape[:2]
             padded = cv2.copyMakeBorder(roi, abs(dy), abs(dy), abs(dx), abs(dx), cv2.BORDER_REPLICATE)
             ay, ax = abs(dy) + dy // 2, abs(dx) + dx // 2
-            by, bx = ay - dy, ax - dx
-            cv2.addWeighted(
-                padded[ay : ay + height, ax : ax + width],
-                0.5,
-                padded[by : by + height, bx : bx + width],
-                0.5,
-                0,
-                roi,
-            )
+            a, b = (padded[y : y + height, x : x + width] for y, x in ((ay, ax), (ay - dy, ax - dx)))
+            cv2.addWeighted(a, 0.5, b, 0.5, 0, roi)
+
+
+def _fill(image: Image, fills: Iterable[tuple[Float, Colour]]) -> None:
+    for outline, colour in fills:
+        raster.fill(image, raster.fixed(outline), colour)
 
 
 def _finger_parts(snapshot: Snapshot) -> list[tuple[int, ...]]:

@@ -75,17 +75,10 @@ class Card:
         x = x0_m + self.speed_m_s * (t_s - self.middle_s)
         if abs(x - x0_m) > 0.6:
             return None
-        left, right = x - self.width_m / 2, x + self.width_m / 2
         lean = 0.012  # the far edge is a little deeper: a card is never held quite straight
-        z = self.depth_m
-        return np.array(
-            [
-                [left, self.top_m, z],
-                [right, self.top_m, z + lean],
-                [right, self.bottom_m, z + lean],
-                [left, self.bottom_m, z],
-            ]
-        )
+        left, right = (x - self.width_m / 2, self.depth_m), (x + self.width_m / 2, self.depth_m + lean)
+        ring = ((left, self.top_m), (right, self.top_m), (right, self.bottom_m), (left, self.bottom_m))
+        return np.array([[x, y, z] for (x, z), y in ring])
 
 
 STANDARD_CARDS = (
@@ -112,7 +105,7 @@ class Scene:
         centre_m: Middle of the volume (3,), rig frame [m].
         light: How the light changes; None: as it was when the colours were calibrated.
         objects: Files of the objects that the rig names.
-        optics: The cameras; tracked: the objects.
+        optics, tracked: The cameras; the objects.
     """
 
     rig: RigCalibration
@@ -124,17 +117,11 @@ class Scene:
     seed: int = STANDARD_SEED
     light: LightSchedule | None = None
     objects: Mapping[str, ObjectProfile] = field(default_factory=dict[str, ObjectProfile])
-    optics: Mapping[str, CameraModel] = field(default_factory=dict[str, CameraModel])
+    optics: Mapping[str, CameraModel] = field(init=False)
     tracked: TrackedObjects = field(init=False)
 
     def __post_init__(self) -> None:
-        for name in self.rig.cameras:
-            if name not in self.cameras:
-                raise CalibrationError(f"rig {self.rig.name!r}: cameras: no camera file for {name!r}")
-        optics = {
-            name: CameraModel.of(self.cameras[name], self.rig.camera_pose(name)) for name in self.rig.cameras
-        }
-        object.__setattr__(self, "optics", optics)
+        object.__setattr__(self, "optics", optics_of(self.rig, self.cameras))
         object.__setattr__(self, "tracked", TrackedObjects.of(self.rig, self.objects))
 
     @classmethod
@@ -152,10 +139,8 @@ class Scene:
             CalibrationError: A camera of the rig is missing or has no intrinsics; a marker is on no finger;
                 an object of the rig has no file.
         """
-        model = HandModel.of(hand)
-        centre = view_centre(rig)
-        motion = ScriptedMotion(model, centre, seed)
-        return cls(rig, cameras, model, motion, centre, STANDARD_CARDS, seed, objects=objects or {})
+        motion = ScriptedMotion(HandModel.of(hand), view_centre(rig), seed)
+        return cls.of_motion(rig, cameras, hand, motion, seed, objects, STANDARD_CARDS)
 
     @classmethod
     def of_motion(
@@ -166,10 +151,12 @@ class Scene:
         motion: HandMotion,
         seed: int = STANDARD_SEED,
         objects: Mapping[str, ObjectProfile] | None = None,
+        cards: tuple[Card, ...] = (),
     ) -> "Scene":
-        """Create a scene without occluders for any motion."""
-        model, centre = HandModel.of(hand), view_centre(rig)
-        return cls(rig, cameras, model, motion, centre, (), seed, objects=objects or {})
+        """Create a scene for any motion, by default without occluders; raises as above."""
+        return cls(
+            rig, cameras, HandModel.of(hand), motion, view_centre(rig), cards, seed, objects=objects or {}
+        )
 
     @property
     def period_s(self) -> float:
@@ -211,13 +198,6 @@ class Scene:
             points[marker] = transform(poses[which], at)
         return points
 
-    def joints(self, times_s: tuple[float, ...]) -> HandJoints:
-        """Return the joints at several times, stacked along the first axis."""
-        states = [self.motion.at(t) for t in times_s]
-        return self.model.forward(
-            np.stack([state.T_rig_palm for state in states]), np.stack([state.angles_rad for state in states])
-        )
-
     def occluders(self, t_s: float) -> tuple[Float, ...]:
         """Corners (4, 3) [m] of every card that is near the view, rig frame."""
         t = max(t_s, 0.0) % self.period_s
@@ -228,6 +208,18 @@ class Scene:
         """Timing of a camera: each 5 ms after the one before, clocks 50 ppm apart."""
         place = self.rig.cameras.index(camera)
         return CameraTiming(place * LATE_NS, place * APART_PPM)
+
+
+def optics_of(rig: RigCalibration, cameras: Mapping[str, CameraCalibration]) -> dict[str, CameraModel]:
+    """The rig's cameras as geometry.
+
+    Raises:
+        CalibrationError: One has no file, no place or no intrinsics: a simulated camera must have a lens.
+    """
+    for name in rig.cameras:
+        if name not in cameras:
+            raise CalibrationError(f"rig {rig.name!r}: cameras: no camera file for {name!r}")
+    return {name: CameraModel.of(cameras[name], rig.camera_pose(name)) for name in rig.cameras}
 
 
 def view_centre(rig: RigCalibration) -> Float:

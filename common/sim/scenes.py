@@ -34,15 +34,13 @@ from common.hand.model import HandModel
 from common.sim.board import BOARD, BoardRenderer, BoardScene, Print
 from common.sim.light import DESK_LINEAR_RGB, ROOM, TO_LIGHT_RIG, face_shade, marker_colour
 from common.sim.motion import (
-    FIST,
-    PERIOD_S,
-    REST,
-    Drift,
+    DriftingMotion,
     HandState,
     StudyPoses,
     Waves,
     angles_of,
     base_pose,
+    closing,
     smooth_step,
     window,
 )
@@ -112,20 +110,17 @@ COMES_S = (45.0, 46.6, 51.4, 53.0)
 CARDS = (Card(middle_s=40.0, width_m=0.09, top_m=-0.40, bottom_m=0.005, depth_m=0.36, speed_m_s=0.09),)
 
 
-class ObjectTravel:
-    """Motion of a travelling object and the hand, and its script."""
-
-    period_s = PERIOD_S
+class ObjectTravel(DriftingMotion):
+    """Motion of a travelling object and the hand."""
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
-        """Of a hand and an object about a place (3,) [m]; the same seed, the same motion."""
         rng = np.random.default_rng([seed, 37])
-        self._model, self._centre = model, np.asarray(centre_m, dtype=np.float64)
-        self._wander, self._drift, self._wrist = Waves(rng, 6), Drift(rng), Waves(rng, 5)
+        self._wander = Waves(rng, 6)
+        super().__init__(model, centre_m, rng)
+        self._fingers = Waves(rng, 5)
         self._place = self._centre + AT_M + rng.uniform(-0.01, 0.01, 3)
-        self._facing = rotation_vector_to_matrix(np.radians(rng.uniform(-20.0, 20.0, 3))) @ facing(
-            np.radians(25.0)
-        )
+        own = rotation_vector_to_matrix(np.radians(rng.uniform(-20.0, 20.0, 3)))
+        self._facing = own @ facing(np.radians(25.0))
         way = np.array([1.0, 0.0, 0.0]) + rng.uniform(-1.0, 1.0, 3) * np.array([0.0, 0.6, 0.8])
         self._way = way / np.linalg.norm(way)
         self._rate = 2.0 * np.pi * float(rng.uniform(*SHUTTLE_HZ))
@@ -134,19 +129,13 @@ class ObjectTravel:
         self._spins = axes[rng.permutation(2)] * rng.choice((-1.0, 1.0), (2, 1))
         self._before = BEFORE_M + rng.uniform(-1.0, 1.0, 3) * np.array([0.035, 0.01, 0.01])
 
-    def at(self, t_s: float) -> HandState:
-        """Hand and object at time `t_s` [s]; before 0 those of 0."""
-        t = max(t_s, 0.0) % PERIOD_S
-        wobble, shift, rotation = self._drift.at(t)
+    def _moved(self, t: float, wobble: Float, shift: Float, rotation: Float) -> HandState:
         come, there, leave, gone = COMES_S
         before = smooth_step((t - come) / (there - come)) * smooth_step((gone - t) / (gone - leave))
-        aside = self._centre + ASIDE_M
         shift = shift + (1.0 - before) * ASIDE_M + before * (self._place - self._centre + self._before)
-        share = (1.0 - before) * (0.25 + 0.25 * self._wrist.at(t))
-        rest, fist = np.array(REST, dtype=np.float64), np.array(FIST, dtype=np.float64)
-        posture = rest + share[:, None] * (fist - rest)
-        palm = base_pose(self._model, aside - ASIDE_M, shift, rotation)
-        return HandState(palm, angles_of(self._model, posture, wobble), objects=(self.object_at(t),))
+        posture = closing((1.0 - before) * (0.25 + 0.25 * self._fingers.at(t)))
+        pose = base_pose(self._model, (self._centre + ASIDE_M) - ASIDE_M, shift, rotation)
+        return HandState(pose, angles_of(self._model, posture, wobble), objects=(self.object_at(t),))
 
     def object_at(self, t_s: float) -> Float:
         """`T_rig_object` (4, 4) [m] at a time within the period [s]."""
@@ -167,6 +156,7 @@ class ObjectTravel:
 NAMES = f"standard | lights | poses | hand-routine | object | leap:FILE.npz | {' | '.join(TOGETHER)}"
 VIEWS = f"{NAMES} | board | card"
 _LEAP = "leap:"
+_MOTIONS = {"poses": StudyPoses, "hand-routine": HandRoutine, "object": ObjectTravel}
 
 
 def scene_by_name(
@@ -182,8 +172,7 @@ def scene_by_name(
     `standard`, the same under light that changes (`lights`), the six poses of the Digits study (`poses`), a
     hand that follows the guided routine of `calibrate hand` (`hand-routine`), one beside a tracked object
     that travels (`object`), one that moves as in front of a wrist device at the same time (`TOGETHER`), or
-    one that follows a recorded motion. `objects` are the files of the objects that the rig names
-    (`common.sim.tracked`).
+    one that follows a recorded motion. `objects`: files of the objects that the rig names.
 
     Raises:
         PhalanxError: No such scene; a rig, camera, hand or object that does not fit; a recording that cannot
@@ -197,20 +186,16 @@ def scene_by_name(
         scene = Scene.standard(rig, cameras, hand, seed, objects)
         return scene if name == "standard" else replace(scene, light=ROOM)
     model, centre_m = HandModel.of(hand), view_centre(rig)
-    if name == "poses":
-        motion = StudyPoses(model, centre_m, seed)
-    elif name == "hand-routine":
-        motion = HandRoutine(model, centre_m, seed)
-    elif name == "object":
-        motion = ObjectTravel(model, centre_m, seed)
-    elif name.startswith(_LEAP):
+    if name.startswith(_LEAP):
         motion = load_leap(Path(name.removeprefix(_LEAP)), model, centre_m)
+    elif (make := _MOTIONS.get(name)) is not None:
+        motion = make(model, centre_m, seed)
     else:
         motion = together_motion(name, model, centre_m, seed)
     if motion is None:
         raise PhalanxError(f"scene {name!r}: there are {VIEWS} (board and card for cameras only)")
-    scene = Scene.of_motion(rig, cameras, hand, motion, seed, objects)
-    return replace(scene, cards=CARDS) if name == "object" else scene
+    cards = CARDS if name == "object" else ()
+    return Scene.of_motion(rig, cameras, hand, motion, seed, objects, cards)
 
 
 def view_by_name(
@@ -256,7 +241,7 @@ def renderer_of(
         CalibrationError: The scene has no such camera, or a marker without a colour.
     """
     if isinstance(scene, WristScene):
-        return (
-            WristRenderer(scene, camera, LIVE_STEP, LIVE_WRIST_RAD) if live else WristRenderer(scene, camera)
-        )
+        if live:
+            return WristRenderer(scene, camera, LIVE_STEP, LIVE_WRIST_RAD)
+        return WristRenderer(scene, camera)
     return BoardRenderer(scene, camera) if isinstance(scene, BoardScene) else Renderer(scene, camera)

@@ -39,8 +39,8 @@ from common.sim.wrist.scene import WristScene
 
 GRAVITY_M_S2 = 9.81
 _WANDER_RAD_S = radians(0.03)
-_NOTHING, _NO_QUATERNION = np.full(3, np.nan), np.full(4, np.nan)
 _UNPLACED = "imu: q_palm_imu and q_rig_world: missing; an IMU is simulated as it is mounted"
+_NOTHING, _NO_QUATERNION = np.full(3, np.nan), np.full(4, np.nan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +54,6 @@ class InertialPart:
 
 
 LSM6DSO = InertialPart(radians(3.8e-3), 70e-6 * GRAVITY_M_S2, radians(1.0), 0.01)  # ST, DS12140, table 2
-# TDK, DS-000189, tables 1, 2
-ICM20948 = InertialPart(radians(0.015), 230e-6 * GRAVITY_M_S2, radians(2.5), 0.015)
 
 
 class SimulatedImu:
@@ -102,7 +100,7 @@ class SimulatedImu:
 
     def around(self, start_s: float, stop_s: float, zero_ns: int = 0) -> Iterator[ImuSample]:
         """Yield samples of a span [s] and a filter's lead-in; scene time 0 is `zero_ns`."""
-        rate = self._imu.rate_hz
+        rate = self.rate_hz
         before_s, after_s = 2.0, 0.1  # a filter has to settle before the first frame
         for seq in range(max(ceil((start_s - before_s) * rate), 0), floor((stop_s + after_s) * rate) + 1):
             t_s = seq / rate
@@ -124,15 +122,14 @@ class SimulatedImu:
         new = sqrt(0.5 * self._imu.rate_hz) * np.random.default_rng([self._seed, 1, seq]).normal(size=(2, 3))
         # the mean since the last sample, as a low-pass leaves it
         rate = self._palm_imu.T @ step * self._imu.rate_hz
+        force = rig_imu.T @ (moved + GRAVITY_M_S2 * self._up)
         return ImuSample(
             source=self._imu.name,
             session=0,
             seq=seq,
             t_ns=t_ns,
             gyro_rad_s=self._scale @ rate + self.bias_rad_s(t_s) + self._part.gyro_noise * new[0],
-            accel_m_s2=rig_imu.T @ (moved + GRAVITY_M_S2 * self._up)
-            + self._zero_g
-            + self._part.accel_noise * new[1],
+            accel_m_s2=force + self._zero_g + self._part.accel_noise * new[1],
             mag_ut=_NOTHING,
             orientation_wxyz=_NO_QUATERNION,
         )

@@ -1,4 +1,4 @@
-"""Surfaces shape the simulated hand, its markers and the things it takes.
+"""Surfaces shape the simulated hand and its markers.
 
 Few points, as a fast renderer needs. The hand is spheres joined to tapered capsules (phalanges) and hulls (palm,
 thumb web, sleeve). All places that move are *key points* of one array, so that a camera can bring each to the moment
@@ -11,21 +11,17 @@ the cap is placed so that this is exactly the profile's marker offset. The back 
 sides, placed by its area centroid likewise.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from common.arrays import Float
 from common.errors import CalibrationError
-from common.geometry.transforms import transform
 from common.hand.model import CHAINS, METACARPALS, Chains, HandModel
-from common.sim import raster
 from common.sim.light import LAYER_COSINES
-from common.sim.motion import Cylinder
-from common.sim.raster import Shape
 
 CYLINDER_SHARE = 0.7
+CENTROID_AHEAD = 0.5 * (1.0 - CYLINDER_SHARE)  # of a cap's centre, in its radius: the middle of [-0.7 R, R]
 BOX_M = (0.025, 0.003, 0.020)  # along the palm's x, y (thickness), z
 # The skin below the marker is a little smaller and shorter, so that it does not shine out around it.
 SKIN_UNDER_CAP = 0.86
@@ -84,11 +80,6 @@ class HandSurface:
     weights: Float
     still: Float
 
-    @property
-    def count(self) -> int:
-        """Number of key points."""
-        return len(self.weights)
-
     @classmethod
     def of(cls, model: HandModel, markers: tuple[str, ...], free: tuple[str, ...] = ()) -> "HandSurface":
         """Lay out the key points of a hand with these markers; `free` are on no hand.
@@ -115,7 +106,7 @@ class HandSurface:
                 radius[4 * finger + 3] *= SKIN_UNDER_CAP
                 ahead = -cap.radius_m * _AXES[4 * finger + 3, 2]
                 centroid = _JOINTS[4 * finger + 3] + mount.offset_m @ _AXES[4 * finger + 3]
-                centre = centroid - cap_centroid_ahead(1.0) * ahead
+                centre = centroid - CENTROID_AHEAD * ahead
                 rows += [centre, centre - CYLINDER_SHARE * ahead]
                 skin_back_share = 0.4
                 rows[4 * finger + 3] = centre - skin_back_share * ahead
@@ -147,14 +138,10 @@ def _chain_rows(chains: Chains) -> Float:
 def _spheres(model: HandModel) -> list[Float]:
     """The middles of all spheres as sums of unit rows."""
     wrist = 0.45 * float(model.radius_m[1])
-    still = [
-        (wrist, -0.003, -0.012),
-        (-wrist, -0.003, -0.012),
-        *model.rest_position_m[list(METACARPALS)],
-    ]
+    ends = (wrist, -0.003, -0.012), (-wrist, -0.003, -0.012)
     return [
         *_JOINTS,
-        *(np.array(point) @ _PALM for point in still),
+        *(np.array(point) @ _PALM for point in (*ends, *model.rest_position_m[list(METACARPALS)])),
         0.38 * model.rest_position_m[6] @ _PALM + 0.62 * _JOINTS[4] - 0.004 * _PALM[1],
         -0.018 * _PALM[2],
         -0.55 * _PALM[2],
@@ -172,11 +159,6 @@ def _sphere_radii(model: HandModel) -> Float:
     radius[WEB_SPHERE] = 0.8 * model.radius_m[7]
     radius[list(SLEEVE_SPHERES)] = 1.3 * wrist, 2.2 * wrist
     return radius
-
-
-def cap_centroid_ahead(radius_m: float) -> float:
-    """How far [m] a cap's centroid is ahead of its centre: middle of [-0.7 R, R]."""
-    return 0.5 * (1.0 - CYLINDER_SHARE) * radius_m
 
 
 def box_corners() -> Float:
@@ -218,9 +200,8 @@ def rim(normal: Float, radius_m: Float, circle: Float) -> Float:
     sign = np.where(z >= 0.0, 1.0, -1.0)
     a = -1.0 / (sign + z)
     b = x * y * a
-    frame = np.empty((*x.shape, 2, 3))
-    frame[..., 0, 0], frame[..., 0, 1], frame[..., 0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
-    frame[..., 1, 0], frame[..., 1, 1], frame[..., 1, 2] = b, sign + y * y * a, -y
+    rows = (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
+    frame = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
     return radius_m[..., None, None] * (circle @ frame)
 
 
@@ -239,37 +220,6 @@ def unit_circle(n: int) -> Float:
 LAYER_SINES = np.sqrt(1.0 - LAYER_COSINES**2)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SeenThing:
-    """One cylinder in one image.
-
-    Attributes:
-        layers: Outlines (N, 2) [px]: its own, then the parts of its side where the light falls more and more
-            steeply.
-        face: Outline (N, 2) [px] of the end that is turned to the camera, and the cosine of its normal to the
-            light.
-        velocity: (2,) [px/s].
-        ends_uv: (2, 2) [px] middles of its ends, ends_depth: (2,) [m].
-    """
-
-    layers: tuple[Float, ...]
-    face: tuple[Float, float]
-    velocity: Float
-    ends_uv: Float
-    ends_depth: Float
-
-    @property
-    def shape(self) -> Shape:
-        """Its outline."""
-        return Shape(self.layers[0], self.velocity)
-
-    def depth(self, uv: Float) -> Float:
-        """Depth (...) [m] of its axis where that passes nearest to pixels (..., 2)."""
-        start, along = self.ends_uv[0], self.ends_uv[1] - self.ends_uv[0]
-        share = np.clip((uv - start) @ along / max(float(along @ along), 1e-9), 0.0, 1.0)
-        return self.ends_depth[0] * (1.0 - share) + self.ends_depth[1] * share
-
-
 def tube_rims(centre: Float, axis: Float, radius_m: float, to_light: Float, circle: Float) -> Float:
     """Shading edges (LAYERS, n, 3) [m] of a tube with unit axis, cut at (3,) [m]."""
     across = to_light - (to_light @ axis) * axis
@@ -277,35 +227,3 @@ def tube_rims(centre: Float, axis: Float, radius_m: float, to_light: Float, circ
     return middle[:, None] + rim(
         np.broadcast_to(axis, (len(LAYER_COSINES), 3)), radius_m * LAYER_SINES, circle
     )
-
-
-def seen(
-    thing: Cylinder,
-    later: Cylinder,
-    later_s: float,
-    T_camera_rig: Float,
-    to_light: Float,
-    circle: Float,
-    project: Callable[[Float], Float],
-) -> SeenThing:
-    """What a camera sees of a thing, which `later_s` [s] on is at `later`.
-
-    `to_light` is a unit vector (3,), camera frame; `circle` is `unit_circle` (n, 2); `project` takes points
-    (..., 3) [m] of the camera frame to pixels (..., 2).
-    """
-    ends, after = (_ends(item, T_camera_rig) for item in (thing, later))
-    axis = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-    rims = project(np.stack([tube_rims(end, axis, thing.radius_m, to_light, circle) for end in ends]))
-    layers = tuple(raster.hull(rims[:, k].reshape(-1, 2)) for k in range(rims.shape[1]))
-    facing = 0 if float(axis @ ends[0]) > 0.0 else 1  # whose outward normal points to the camera
-    outward = axis if facing else -axis
-    ends_uv = project(ends)
-    velocity = (project(after) - ends_uv).mean(axis=0) / later_s
-    return SeenThing(layers, (rims[facing, 0], float(outward @ to_light)), velocity, ends_uv, ends[:, 2])
-
-
-def _ends(thing: Cylinder, T_camera_rig: Float) -> Float:
-    """Middles of both ends (2, 3) [m], camera frame."""
-    half = 0.5 * thing.length_m
-    own = np.array([[0.0, 0.0, -half], [0.0, 0.0, half]])
-    return transform(T_camera_rig, transform(thing.T_rig_object, own))

@@ -13,6 +13,7 @@ device sits on the forearm (`common.hand.wrist`; limits of the bend as flexion /
     both-moves    10 s in which fingers bend one by one and together, the palm turns about all axes; +-25 / +-12
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -20,23 +21,20 @@ import numpy as np
 from common.arrays import Float
 from common.hand.model import HandModel
 from common.sim.gestures import Gestures
-from common.sim.grasp import Grasp
+from common.sim.grasp import MCP_PER_PIP, Grasp
 from common.sim.motion import (
-    FIST,
     PEAK_SPEED_M_S,
     PERIOD_S,
-    REST,
-    Drift,
+    DriftingMotion,
     HandMotion,
     HandState,
     StudyPoses,
     Waves,
-    angles_of,
-    base_pose,
+    closing,
+    station_at,
     window,
 )
 
-TOGETHER = ("grasp", "both-poses", "both-curl", "both-travel", "both-moves", "gestures")
 TYPICAL_FLEXION_DEG = np.array([8.0, 5.0])
 _CURL_LAG_RAD = np.array([0.3, 0.0, 0.1, 0.2, 0.3])  # no finger follows another at once
 _CURL_SPREAD_DEG = np.array([8.0, 4.0, 0.0, -4.0, -8.0])
@@ -49,32 +47,10 @@ MOVES_WRIST_DEG = np.array([25.0, 12.0])
 MOVES_SHIFT_M = np.array([0.05, 0.03, 0.04])
 
 
-def together_motion(name: str, model: HandModel, centre_m: Float, seed: int) -> HandMotion | None:
-    """Motion of a name of `TOGETHER` about (3,) [m], rig frame; None: no such.
-
-    The place alone differs between rigs: with the same hand and seed the fingers, the turns of the palm, the
-    bend of the wrist and the shifts are the same.
-    """
-    if name == "gestures":
-        return Gestures(model, centre_m, seed)
-    if name == "grasp":
-        return Grasp(model, centre_m, seed)
-    if name == "both-poses":
-        return FlexedWrist(StudyPoses(model, centre_m, seed), seed)
-    if name == "both-curl":
-        return FlexedWrist(Curls(model, centre_m, seed), seed)
-    if name == "both-travel":
-        return FlexedWrist(Travel(model, centre_m, seed), seed)
-    if name == "both-moves":
-        return Moves(model, centre_m, seed)
-    return None
-
-
 class FlexedWrist:
     """Motion during which the wrist also flexes as in normal use."""
 
     def __init__(self, motion: HandMotion, seed: int) -> None:
-        """Of a motion with the usual period."""
         self._motion, self.period_s = motion, motion.period_s
         self._waves = Waves(np.random.default_rng([seed, 19]), 2, motion.period_s)
 
@@ -84,24 +60,18 @@ class FlexedWrist:
         return replace(self._motion.at(t_s), wrist_angles_rad=wrist_angles)
 
 
-class Curls:
+class Curls(DriftingMotion):
     """All fingers curl and stretch six times a minute while the palm slowly rotates."""
 
-    period_s = PERIOD_S
-
     def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
-        """Of a hand about a place (3,) [m]; the same seed, the same motion."""
         rng = np.random.default_rng([seed, 23])
-        self._model, self._centre = model, np.asarray(centre_m, dtype=np.float64)
-        self._drift, self._rotations = Drift(rng), Waves(rng, 3)
+        super().__init__(model, centre_m, rng)
+        self._rotations = Waves(rng, 3)
         curl_pip_deg = 101.0
         self._most = curl_pip_deg * (1.0 - rng.uniform(0.0, 0.06, 4))
-        mcp_per_pip = 0.54  # Kamper's ratio, in Kim et al. 2012
-        self._ratio = mcp_per_pip * (1.0 + rng.normal(0.0, 0.06, 4))
+        self._ratio = MCP_PER_PIP * (1.0 + rng.normal(0.0, 0.06, 4))
 
-    def at(self, t_s: float) -> HandState:
-        """The hand at time `t_s` [s]; before 0 the pose of 0."""
-        t = max(t_s, 0.0) % PERIOD_S
+    def _moved(self, t: float, wobble: Float, shift: Float, rotation: Float) -> HandState:
         curl_s, straight_deg = 10.0, 4.0
         share = 0.5 - 0.5 * np.cos(2.0 * np.pi * t / curl_s - _CURL_LAG_RAD)
         pip = share[1:] * self._most
@@ -109,83 +79,78 @@ class Curls:
         posture[0] = _THUMB_DEG[0] + share[0] * (_THUMB_DEG[1] - _THUMB_DEG[0])
         posture[1:, 0] = _CURL_SPREAD_DEG[1:] * (1.0 - share[1:])
         posture[1:, 1], posture[1:, 2] = straight_deg + self._ratio * pip, straight_deg + pip
-        wobble, shift, rotation = self._drift.at(t)
         curl_rotation_deg = 14.0
         rotation = rotation + np.radians(curl_rotation_deg) * self._rotations.at(t)
-        return HandState(
-            base_pose(self._model, self._centre, shift, rotation), angles_of(self._model, posture, wobble)
-        )
+        return self._state(posture, wobble, shift, rotation)
 
 
-class Travel:
+class Travel(DriftingMotion):
     """The hand moves to and fro, ten ways a minute, while its fingers move slowly."""
 
-    period_s = PERIOD_S
-
     def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
-        """Of a hand about a place (3,) [m]; the same seed, the same motion."""
         rng = np.random.default_rng([seed, 29])
-        self._model, self._centre = model, np.asarray(centre_m, dtype=np.float64)
-        self._drift, self._wrist = Drift(rng), Waves(rng, 5)
+        super().__init__(model, centre_m, rng)
+        self._fingers = Waves(rng, 5)
         count = round(PERIOD_S / TRAVEL_S)
         way = np.array([1.0, 0.0, 0.0]) + rng.uniform(-1.0, 1.0, (count, 3)) * np.array([0.2, 0.4, 0.6])
         self._way = way / np.linalg.norm(way, axis=1, keepdims=True)
         self._rate_hz = rng.uniform(*TRAVEL_HZ, count)
 
-    def at(self, t_s: float) -> HandState:
-        """The hand at time `t_s` [s]; before 0 the pose of 0."""
-        t = max(t_s, 0.0) % PERIOD_S
-        k = min(int(t / TRAVEL_S), len(self._way) - 1)
-        s, rate = t - k * TRAVEL_S, 2.0 * np.pi * float(self._rate_hz[k])
+    def _moved(self, t: float, wobble: Float, shift: Float, rotation: Float) -> HandState:
+        k, s = station_at(t, TRAVEL_S, len(self._way))
+        rate = 2.0 * np.pi * float(self._rate_hz[k])
         travel_fade_s = 0.6
         size = window(s, 0.0, TRAVEL_S, travel_fade_s) * 0.98 * PEAK_SPEED_M_S / rate
-        wobble, shift, rotation = self._drift.at(t)
-        share = 0.35 + 0.35 * self._wrist.at(t)
-        rest, fist = np.array(REST, dtype=np.float64), np.array(FIST, dtype=np.float64)
-        posture = rest + share[:, None] * (fist - rest)
         shift = shift + size * np.sin(rate * s) * self._way[k]
-        return HandState(
-            base_pose(self._model, self._centre, shift, rotation), angles_of(self._model, posture, wobble)
-        )
+        return self._state(closing(0.35 + 0.35 * self._fingers.at(t)), wobble, shift, rotation)
 
 
-class Moves:
-    """Ten seconds of all motions that reveal the mounting."""
+class Moves(DriftingMotion):
+    """Ten seconds of all motions that reveal where the device sits."""
 
     period_s = MOVES_S
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
-        """Of a hand about a place (3,) [m]; the same seed, the same motion."""
         rng = np.random.default_rng([seed, 31])
-        self._model, self._centre = model, np.asarray(centre_m, dtype=np.float64)
-        self._drift = Drift(rng, MOVES_S)
+        super().__init__(model, centre_m, rng, MOVES_S)
         self._order = rng.permutation(5)
         self._depth = rng.uniform(0.75, 0.95, 5)
         # Turns, shifts, bends: each a wave of its own that closes over the period.
-        self._cycles = np.concatenate(
-            [rng.permutation([3, 4, 5]), rng.permutation([2, 3, 4]), rng.permutation([4, 5])]
-        )
+        self._cycles = np.concatenate([rng.permutation(n) for n in ([3, 4, 5], [2, 3, 4], [4, 5])])
         self._phase = rng.uniform(0.0, 2.0 * np.pi, 8)
 
-    def at(self, t_s: float) -> HandState:
-        """The hand at time `t_s` [s]; before 0 the pose of 0."""
-        t = max(t_s, 0.0) % MOVES_S
+    def _moved(self, t: float, wobble: Float, shift: Float, rotation: Float) -> HandState:
         share = np.empty(5)
         for place, finger in enumerate(self._order):
             start = 0.3 + 0.8 * place
             share[finger] = window(t, start, start + 1.1, 0.5)
         together = window(t, 4.9, 9.7, 0.5) * 0.5 * (1.0 - np.cos(2.0 * np.pi * (t - 4.9) * 3.0 / 4.8))
-        share = self._depth * np.maximum(share + together, 0.0)
+        posture = closing(self._depth * np.maximum(share + together, 0.0))
         wave = np.sin(2.0 * np.pi * self._cycles * t / MOVES_S + self._phase)
-        rest, fist = np.array(REST, dtype=np.float64), np.array(FIST, dtype=np.float64)
-        posture = rest + share[:, None] * (fist - rest)
-        wobble, shift, rotation = self._drift.at(t)
-        pose = base_pose(
-            self._model,
-            self._centre,
+        shift, rotation = (
             shift + MOVES_SHIFT_M * wave[3:6],
             rotation + np.radians(MOVES_ROTATION_DEG) * wave[:3],
         )
-        return HandState(
-            pose, angles_of(self._model, posture, wobble), np.radians(MOVES_WRIST_DEG) * wave[6:]
-        )
+        state = self._state(posture, wobble, shift, rotation)
+        return replace(state, wrist_angles_rad=np.radians(MOVES_WRIST_DEG) * wave[6:])
+
+
+_MOTIONS: Mapping[str, Callable[[HandModel, Float, int], HandMotion]] = {
+    "grasp": Grasp,
+    "both-poses": lambda model, centre_m, seed: FlexedWrist(StudyPoses(model, centre_m, seed), seed),
+    "both-curl": lambda model, centre_m, seed: FlexedWrist(Curls(model, centre_m, seed), seed),
+    "both-travel": lambda model, centre_m, seed: FlexedWrist(Travel(model, centre_m, seed), seed),
+    "both-moves": Moves,
+    "gestures": Gestures,
+}
+TOGETHER = tuple(_MOTIONS)
+
+
+def together_motion(name: str, model: HandModel, centre_m: Float, seed: int) -> HandMotion | None:
+    """Motion of a name of `TOGETHER` about (3,) [m], rig frame; None: no such.
+
+    The place alone differs between rigs: with the same hand and seed the fingers, the turns of the palm, the
+    bend of the wrist and the shifts are the same.
+    """
+    make = _MOTIONS.get(name)
+    return None if make is None else make(model, centre_m, seed)

@@ -6,7 +6,7 @@ the hand. The surface is rods, blocks, balls, beads and tags; all places are key
 hand (`surface`), so that a camera brings each to the moment at which its own row is exposed.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -159,26 +159,31 @@ class ObjectSurface:
     @classmethod
     def of(cls, tracked: TrackedObjects, markers: Sequence[str]) -> "ObjectSurface":
         """Lay out the key points of all objects; `markers` are those of the rig."""
-        layout = _Layout()
+        points: list[Float] = [np.zeros((0, 3))]
+        owner: list[int] = []
         parts: list[Part] = []
         beads: list[Ball] = []
         sheets: list[Sheet] = []
         beads_of: list[slice] = []
         sheets_of: list[slice] = []
-        for profile in tracked.profiles:
+        for which, profile in enumerate(tracked.profiles):
+
+            def add(more: Float, which: int = which) -> slice:
+                points.append(more)
+                owner.extend([which] * len(more))
+                return slice(len(owner) - len(more), len(owner))
+
             first, bead, sheet = len(parts), len(beads), len(sheets)
-            parts += [_part(shape, layout) for shape in profile.shape]
+            parts += [_part(shape, add) for shape in profile.shape]
             for name, ball in profile.markers.items():
-                beads.append(
-                    Ball(layout.add(np.array([ball.position_m])), ball.radius_m, markers.index(name))
-                )
-            sheets += _sheets(profile, first, layout)
+                beads.append(Ball(add(np.array([ball.position_m])), ball.radius_m, markers.index(name)))
+            sheets += _sheets(profile, first, add)
             beads_of.append(slice(bead, len(beads)))
             sheets_of.append(slice(sheet, len(sheets)))
-            layout.which += 1
-        local = np.concatenate([np.zeros((0, 3)), *layout.points])
-        owner = np.array(layout.owner, dtype=np.intp)
-        return cls(tuple(parts), tuple(beads), tuple(sheets), tuple(beads_of), tuple(sheets_of), local, owner)
+        local, owners = np.concatenate(points), np.array(owner, dtype=np.intp)
+        return cls(
+            tuple(parts), tuple(beads), tuple(sheets), tuple(beads_of), tuple(sheets_of), local, owners
+        )
 
     def key_points(self, poses: Float) -> Float:
         """Key points (..., K, 3) [m], rig frame, of poses (..., O, 4, 4) of the objects."""
@@ -186,35 +191,17 @@ class ObjectSurface:
         return np.einsum("...kij,kj->...ki", own[..., :3, :3], self.local) + own[..., :3, 3]
 
 
-class _Layout:
-    """Collects key points. Holds them, whose they are, and whose come next."""
-
-    def __init__(self) -> None:
-        self.points: list[Float] = []
-        self.owner: list[int] = []
-        self.which = 0
-
-    def add(self, points: Float) -> slice:
-        """Add points (n, 3) [m] in the frame of the present object; return their slice."""
-        start = len(self.owner)
-        self.points.append(points)
-        self.owner += [self.which] * len(points)
-        return slice(start, len(self.owner))
-
-
-def _part(shape: Shape, layout: _Layout) -> Part:
+def _part(shape: Shape, add: Callable[[Float], slice]) -> Part:
     pose = np.eye(4) if shape.T_object_part is None else np.array(shape.T_object_part, dtype=np.float64)
     if isinstance(shape, BoxShape):
-        return Block(layout.add(transform(pose, BLOCK_CORNERS * np.array(shape.size_m))))
+        return Block(add(transform(pose, BLOCK_CORNERS * np.array(shape.size_m))))
     if isinstance(shape, CylinderShape):
-        half = 0.5 * shape.length_m
-        return Rod(
-            layout.add(transform(pose, np.array([[0.0, 0.0, -half], [0.0, 0.0, half]]))), shape.radius_m
-        )
-    return Ball(layout.add(pose[None, :3, 3]), shape.radius_m)
+        ends = 0.5 * shape.length_m * np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
+        return Rod(add(transform(pose, ends)), shape.radius_m)
+    return Ball(add(pose[None, :3, 3]), shape.radius_m)
 
 
-def _sheets(profile: ObjectProfile, first: int, layout: _Layout) -> list[Sheet]:
+def _sheets(profile: ObjectProfile, first: int, add: Callable[[Float], slice]) -> list[Sheet]:
     """The tags of an object whose first part is number `first`."""
     if profile.tags is None:
         return []
@@ -225,7 +212,7 @@ def _sheets(profile: ObjectProfile, first: int, layout: _Layout) -> list[Sheet]:
         pose = np.array(tag.T_object_tag, dtype=np.float64)
         paper, square = (transform(pose, tag_corners(tag.edge_m * size)) for size in (margin, 1.0))
         on = _block_under(profile.shape, pose[:3, 3])
-        place = layout.add(np.vstack([paper, square]))
+        place = add(np.vstack([paper, square]))
         sheets.append(Sheet(place, family, tag.id, None if on is None else first + on))
     return sheets
 
@@ -234,11 +221,8 @@ def _block_under(shapes: Sequence[Shape], point: Float) -> int | None:
     """Place among the shapes of the box on whose surface a point (3,) lies."""
     for k, shape in enumerate(shapes):
         if isinstance(shape, BoxShape):
-            own = (
-                point
-                if shape.T_object_part is None
-                else transform(invert(np.array(shape.T_object_part)), point)
-            )
+            pose = shape.T_object_part
+            own = point if pose is None else transform(invert(np.array(pose)), point)
             beyond = np.abs(own) - 0.5 * np.array(shape.size_m)
             on_m = 0.003  # a tag as near as this to a block's surface is stuck on it
             if abs(float(beyond.max())) < on_m:

@@ -14,15 +14,24 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
-from common.geometry.transforms import invert, transform
+from common.geometry.transforms import cross, invert, transform
 from common.sim import raster
 from common.sim.light import LAYER_COSINES, TO_LIGHT_RIG
 from common.sim.motion import Cylinder, HandState
-from common.sim.objects_seen import Appearances, Points, SeenObjects, SeenPart, project_all
+from common.sim.objects_seen import (
+    Appearances,
+    Points,
+    SeenObjects,
+    SeenPart,
+    depth_along,
+    ends_of,
+    project_all,
+)
 from common.sim.raster import Int32, Shape
 from common.sim.scene import Scene
 from common.sim.surface import (
     CAPSULES,
+    CENTROID_AHEAD,
     CYLINDER_SHARE,
     LAYER_SINES,
     PALM_HULL,
@@ -30,11 +39,8 @@ from common.sim.surface import (
     SPHERE_COUNT,
     WEB_HULL,
     HandSurface,
-    SeenThing,
-    cap_centroid_ahead,
     cap_outline,
     rim,
-    seen,
     tube_rims,
     unit,
     unit_circle,
@@ -90,7 +96,7 @@ class Snapshot:
     web: tuple[Float, ...]
     sleeve: tuple[Float, ...]
     into_sleeve: bool
-    things: tuple[SeenThing, ...]
+    things: tuple[SeenPart, ...]
     tracked: SeenObjects
 
 
@@ -125,12 +131,12 @@ class View:
         self._fine_circle = unit_circle(32)
         self.objects = ObjectSurface.of(scene.tracked, scene.rig.markers)
         self._appearances = Appearances(self.to_light, self.circle, self.focal_px, self.project)
-        count = self.surface.count + len(self.objects.local)
+        count = len(self.surface.weights) + len(self.objects.local)
         # Points of one marker share the moment of the marker's centroid: row k weighs the rows for point k.
         together = np.eye(count)
         for box in self.surface.boxes:
             together[box.corners, box.corners] = 1.0 / 8.0
-        ahead = cap_centroid_ahead(1.0) / CYLINDER_SHARE
+        ahead = CENTROID_AHEAD / CYLINDER_SHARE
         for cap in caps:
             together[[cap.centre, cap.base], cap.centre] = 1.0 + ahead
             together[[cap.centre, cap.base], cap.base] = -ahead
@@ -155,7 +161,7 @@ class View:
         lit = body[:, None] + self._to_lit
         size = self.focal_px * self._radius / np.maximum(body[:, 2], NEAREST_M)
         discs_px = size[:, None] * LAYER_SINES
-        centre, base = points[self.cap_centre], points[self.cap_base]
+        centre, base, (cuff, elbow) = points[self.cap_centre], points[self.cap_base], points[[_CUFF, _ELBOW]]
         axis, joint = unit(centre - base), points[self._cap_joint]
         half = unit(self.to_light - unit(centre))
         parts = (
@@ -163,10 +169,10 @@ class View:
             cap_outline(centre, base, self.cap_radius, self._fine_circle),
             joint[:, None] + rim(axis, self.surface.radius_m[self._cap_joint], self.circle),
             centre + self.cap_radius[:, None] * half,
-            self._cuff(points),
+            tube_rims(cuff, unit(cuff - elbow), self.surface.radius_m[_CUFF], self.to_light, self.circle),
         )
         discs_uv, cap_uv, joint_uv, shine_uv, cuff_uv = project_all(self.project, parts)
-        a, b, own = self._from, self._to, slice(self.surface.count, None)
+        a, b, own = self._from, self._to, slice(len(self.surface.weights), None)
         outlines = raster.capsules(discs_uv[a], discs_px[a], discs_uv[b], discs_px[b])
         shine_share = 0.17  # radius of the glossy spot, share of the cap's
         spots = raster.discs(shine_uv, shine_share * discs_px[SPHERE_COUNT::2, 0], self.circle)
@@ -190,9 +196,9 @@ class View:
             palm=_hulls(discs[_PALM]),
             web=_hulls(discs[_WEB]),
             sleeve=tuple(raster.hull(layer) for layer in sleeve),
-            into_sleeve=_looks_into(*points[[_CUFF, _ELBOW]]),
+            into_sleeve=_looks_into(cuff, elbow),
             things=self._things(t_s, things),
-            tracked=self._appearances.seen(
+            tracked=self._appearances.objects(
                 self.objects, Points(points[own], uv[own], speed_uv[own], when[own])
             ),
         )
@@ -212,8 +218,7 @@ class View:
 
     def shows_back(self, snapshot: Snapshot) -> bool:
         """Whether the back of the hand is turned to the camera."""
-        _, offset = _palm_plane(snapshot)
-        return offset * self.scene.model.side_sign > 0.0
+        return _palm_plane(snapshot)[1] * self.scene.model.side_sign > 0.0
 
     def cards(self, snapshot: Snapshot) -> tuple[Shape, ...]:
         """Outlines of the cards near the view, at the moment of the hand's middle row."""
@@ -252,21 +257,16 @@ class View:
         poses = np.array([self.scene.object_poses(state) for state in states])
         return np.concatenate([hand, self.objects.key_points(poses)], axis=1)
 
-    def _things(self, t_s: float, things: tuple[Cylinder, ...]) -> tuple[SeenThing, ...]:
+    def _things(self, t_s: float, things: tuple[Cylinder, ...]) -> tuple[SeenPart, ...]:
         """Each of `things` halfway, at the moment of the row of its centre."""
-        views: list[SeenThing] = []
+        views: list[SeenPart] = []
         for k, thing in enumerate(things):
             middle = transform(self.T_camera_rig, thing.T_rig_object[:3, 3])
             when = t_s + float(self.project(middle)[1]) * self.row_s
-            now, later = (self.scene.untracked(self.scene.motion.at(t))[k] for t in (when, when + 1e-3))
-            views.append(seen(now, later, 1e-3, self.T_camera_rig, self.to_light, self.circle, self.project))
+            states = (self.scene.motion.at(t) for t in (when, when + 1e-3))
+            now, later = (ends_of(self.scene.untracked(state)[k], self.T_camera_rig) for state in states)
+            views.append(self._appearances.thing(now, later, 1e-3, thing.radius_m))
         return tuple(views)
-
-    def _cuff(self, points: Float) -> Float:
-        """Front edges (LAYERS, n, 3) of the sleeve's shading, its own edge first."""
-        start, end = points[SLEEVE_SPHERES[0]], points[SLEEVE_SPHERES[1]]
-        radius = float(self.surface.radius_m[SLEEVE_SPHERES[0]])
-        return tube_rims(start, unit(start - end), radius, self.to_light, self.circle)
 
 
 def _hulls(discs: Float) -> tuple[Float, ...]:
@@ -283,8 +283,7 @@ def _looks_into(cuff: Float, end: Float) -> bool:
 def _palm_plane(snapshot: Snapshot) -> tuple[Float, float]:
     """Normal (3,) and offset, camera frame, of wrist, index and little knuckle."""
     wrist, index, little = snapshot.points[20], snapshot.points[4], snapshot.points[16]
-    (ax, ay, az), (bx, by, bz) = index - wrist, little - wrist
-    normal = np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+    normal = cross(index - wrist, little - wrist)
     return normal, float(normal @ wrist)
 
 
@@ -311,10 +310,18 @@ class Places:
     behind_palm: Bool
     phalanx: Int
 
+    @classmethod
+    def of(
+        cls, uv: Sequence[Float], depth: Float, outlines: Sequence[Float], behind_palm: Bool, phalanx: Int
+    ) -> "Places":
+        """Of markers with outlines (n, 2) [px]."""
+        low, high = (np.array([f(one, axis=0) for one in outlines]).reshape(-1, 2) for f in (np.min, np.max))
+        middles = np.array(uv).reshape(-1, 2)
+        return cls(middles, depth, low - REACH_PX, high + REACH_PX, behind_palm, phalanx)
+
 
 def hand_before(snapshot: Snapshot, places: Places) -> list[list[Shape]]:
     """Outlines of phalanges, sleeve and palm that may occlude each marker."""
-    surface = _phalanges_before(snapshot, places)
     speed = 0.5 * snapshot.speed_uv[CAPSULES].sum(axis=1)
     sleeve = Shape(snapshot.sleeve[0], snapshot.speed_uv[SLEEVE_SPHERES[0]])
     palm = Shape(snapshot.palm[0], snapshot.palm_speed)
@@ -325,29 +332,44 @@ def hand_before(snapshot: Snapshot, places: Places) -> list[list[Shape]]:
             *([palm] if behind else []),
         ]
         for phalanges, covered, behind in zip(
-            surface, _sleeve_before(snapshot, places).tolist(), places.behind_palm.tolist(), strict=True
+            _phalanges_before(snapshot, places),
+            _sleeve_before(snapshot, places).tolist(),
+            places.behind_palm.tolist(),
+            strict=True,
         )
     ]
 
 
 def things_before(
-    snapshot: Snapshot, places: Places, k: int, depth_m: float, but: SeenPart | None = None
-) -> Sequence[Shape]:
-    """Outlines of things and parts, but one, nearer than a depth before marker `k`."""
-    if not (snapshot.things or snapshot.tracked.solid):
-        return ()
-    uv = places.uv[k]
-    found = [thing.shape for thing in snapshot.things if float(thing.depth(uv)) < depth_m]
-    parts = snapshot.tracked.before(uv, depth_m, places.low[k], places.high[k])
-    return found + [part.shape for part in parts if part is not but]
+    snapshot: Snapshot, places: Places, depth_m: Float, but: Sequence[SeenPart | None] = ()
+) -> list[list[Shape]]:
+    """Outlines of things and parts nearer than depths (N,) [m] before each marker.
+
+    `but`: of each marker the part that it is on.
+    """
+    things = len(snapshot.things)
+    solid = (*snapshot.things, *snapshot.tracked.solid)
+    if not solid:
+        return [[] for _ in depth_m]
+    (start_uv, stop_uv), (start_m, stop_m) = (
+        np.moveaxis(np.array(ends), 1, 0)
+        for ends in ([part.ends_uv for part in solid], [part.ends_depth for part in solid])
+    )
+    before = depth_along(places.uv[:, None], start_uv, stop_uv, start_m, stop_m) < depth_m[:, None]
+    low, high = (np.array([f(part.outline, axis=0) for part in solid]) for f in (np.min, np.max))
+    touched = raster.overlaps(places.low[:, None], places.high[:, None], low, high)
+    touched[:, :things] = True
+    return [
+        [solid[n].shape for n in np.flatnonzero(row) if not but or solid[n] is not but[k]]
+        for k, row in enumerate(before & touched)
+    ]
 
 
 def _phalanges_before(snapshot: Snapshot, places: Places) -> Bool:
     """Which phalanges (N, PHALANGES) reach into the box of a marker before it."""
-    surface = snapshot.outlines[:, 0]
-    found = raster.overlaps(
-        places.low[:, None], places.high[:, None], surface.min(axis=1), surface.max(axis=1)
-    ) & (_depth_along(snapshot, places.uv[:, None], CAPSULES[:, 0], CAPSULES[:, 1]) < places.depth[:, None])
+    low, high = snapshot.outlines[:, 0].min(axis=1), snapshot.outlines[:, 0].max(axis=1)
+    found = raster.overlaps(places.low[:, None], places.high[:, None], low, high)
+    found &= _depth_along(snapshot, places.uv[:, None], *CAPSULES.T) < places.depth[:, None]
     return found & (places.phalanx[:, None] != np.arange(PHALANGES))
 
 
@@ -360,8 +382,5 @@ def _sleeve_before(snapshot: Snapshot, places: Places) -> Bool:
 
 
 def _depth_along(snapshot: Snapshot, uv: Float, a: Int | int, b: Int | int) -> Float:
-    """Depth (...) [m] of lines `a` - `b` nearest to `uv` (..., 2) [px]."""
-    start, along = snapshot.uv[a], snapshot.uv[b] - snapshot.uv[a]
-    share = ((uv - start) * along).sum(axis=-1) / np.maximum((along * along).sum(axis=-1), 1e-9)
-    share = np.minimum(np.maximum(share, 0.0), 1.0)
-    return np.asarray(snapshot.points[a, 2] * (1.0 - share) + snapshot.points[b, 2] * share)
+    """Depth (...) [m] of lines between key points nearest to `uv` (..., 2) [px]."""
+    return depth_along(uv, snapshot.uv[a], snapshot.uv[b], snapshot.points[a, 2], snapshot.points[b, 2])

@@ -14,6 +14,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -132,7 +133,7 @@ def main() -> None:
     try:
         data = options.model.read_bytes() if options.model else None
         model = chair() if data is None else rr.Asset3D(contents=data, media_type="model/gltf-binary")
-        with ViewerProcess(options.web) as viewer:
+        with closing(ViewerProcess(options.web)) as viewer:
             sys.stderr.write(f"{viewer.address}\n")
             show = rr.RecordingStream("orbit_model")
             show.connect_grpc(viewer.url)

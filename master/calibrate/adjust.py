@@ -1,4 +1,4 @@
-"""The adjustment engine: unknowns that all epochs share, and unknowns of each epoch.
+"""The adjustment engine: shared unknowns, and own unknowns of each epoch.
 
 A calibration minimises a sum of squared residuals, outliers weighed down by a robust loss, over S shared
 unknowns (lenses, bones, a mounting) and L own unknowns of each of T epochs (the pose of a board, a hand). An
@@ -12,11 +12,11 @@ A calibration is a function `equations(x) -> Normal`, which adds its rows and pr
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 import numpy as np
 from scipy.sparse import bsr_array, csc_array
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import splu  # pyright: ignore[reportUnknownVariableType]
 
 from common.arrays import Bool, Float, Int
 
@@ -31,7 +31,7 @@ def cauchy(sigmas: float) -> Loss:
 
 
 def huber(sigmas: float) -> Loss:
-    """Huber's loss: beyond that many standard deviations a residual costs by its size, not its square."""
+    """Huber's loss: beyond that many sigmas a residual costs by its size."""
 
     def loss(chi2: Float) -> tuple[Float, Float]:
         size = np.sqrt(np.maximum(chi2, 1e-24))
@@ -42,7 +42,7 @@ def huber(sigmas: float) -> Loss:
 
 
 def geman_mcclure(sigmas: float) -> Loss:
-    """Geman and McClure's loss: a residual far beyond that many standard deviations costs itself alone."""
+    """Geman and McClure's loss: the cost of a residual is bounded."""
 
     def loss(chi2: Float) -> tuple[Float, Float]:
         share = 1.0 / (1.0 + chi2 / sigmas**2)
@@ -52,7 +52,7 @@ def geman_mcclure(sigmas: float) -> Loss:
 
 
 def tukey(sigmas: float) -> Loss:
-    """Tukey's biweight: beyond that many standard deviations a residual does not count at all."""
+    """Tukey's biweight: beyond that many sigmas a residual does not count."""
 
     def loss(chi2: Float) -> tuple[Float, Float]:
         near = np.clip(1.0 - chi2 / sigmas**2, 0.0, 1.0)
@@ -62,7 +62,7 @@ def tukey(sigmas: float) -> Loss:
 
 
 def weigh(residual: Float, loss: Loss | None, group: int, share: Float | float = 1.0) -> tuple[float, Float]:
-    """Cost of residuals (E, R), and the factors (E, R) by which each is weighed down; as of `Normal.add`."""
+    """Cost and weights (E, R) of residuals (E, R), as of `Normal.add`."""
     count = len(residual)
     known = np.isfinite(residual)
     chi2 = (np.where(known, residual, 0.0).reshape(count, -1, group) ** 2).sum(axis=-1)
@@ -72,30 +72,8 @@ def weigh(residual: Float, loss: Loss | None, group: int, share: Float | float =
     return float((share * cost.sum(axis=-1)).sum()), root
 
 
-@dataclass(frozen=True, slots=True)
-class Unknown:
-    """One group of shared unknowns."""
-
-    name: str
-    count: int
-    sigma: float = np.inf  # prior standard deviation of each; inf: none
-
-
-class Layout:
-    """Where each group of shared unknowns stands among all: `layout["shift"]` is its slice."""
-
-    def __init__(self, *groups: Unknown) -> None:
-        ends = np.cumsum([group.count for group in groups]).tolist()
-        self.slices = {g.name: slice(end - g.count, end) for g, end in zip(groups, ends, strict=True)}
-        self.size: int = ends[-1]
-        self.sigma: Float = np.repeat([group.sigma for group in groups], [group.count for group in groups])
-
-    def __getitem__(self, name: str) -> slice:
-        return self.slices[name]
-
-
 class Normal:
-    """Normal equations of S shared unknowns and L own unknowns of each of T epochs, as added so far.
+    """Normal equations of S shared unknowns, and L own unknowns of each of T epochs.
 
     Attributes:
         cost: Sum of the losses; without a robust loss, chi square.
@@ -157,7 +135,7 @@ class Normal:
                 self.mixed[epochs] = mixed
 
     def hold(self, held: Bool) -> None:
-        """Keep own unknowns (T, L) where they are in the next step, such as an angle pushed beyond its limit."""
+        """Keep own unknowns (T, L) in the next step, as an angle at its limit."""
         moves = np.where(held, 0.0, 1.0)
         for d in range(min(self.own.shape[1], len(moves))):
             count = len(moves) - d
@@ -167,7 +145,7 @@ class Normal:
         self.own_gradient *= moves
 
     def add_prior(self, away: Float, sigma: Float) -> None:
-        """Add a prior of the shared unknowns: `away` (S,) from its mean, of widths (S,); inf: none."""
+        """Add a prior of the shared unknowns: `away` (S,) from its mean, `sigma` (S,)."""
         info = sigma**-2.0
         self.cost += float((away**2 * info).sum())
         self.shared[np.diag_indices_from(self.shared)] += info
@@ -188,11 +166,9 @@ class Normal:
         if not count:
             return information, self.gradient, self.mixed, self.own_gradient
         sides = np.concatenate([self.mixed, self.own_gradient[..., None]], axis=-1).reshape(-1, size + 1)
-        options = {
-            "SymmetricMode": True
-        }  # positive definite, and in the order of time: no pivots, little fill
-        factor = splu(self._matrix(damping), permc_spec="NATURAL", diag_pivot_thresh=0.0, options=options)
-        solved = np.asarray(factor.solve(sides), np.float64)
+        # Positive definite, and in the order of time: no pivots, little fill.
+        how = {"permc_spec": "NATURAL", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+        solved = np.asarray(cast(Any, splu)(self._matrix(damping), **how).solve(sides), np.float64)
         back = sides[:, :size].T @ solved
         solved = solved.reshape(count, length, size + 1)
         return (
@@ -208,15 +184,17 @@ class Normal:
         nothing = 1e-9  # information of what nothing constrains
         blocks, rows, columns = list[Float](), list[Int](), list[Int]()
         for d in range(min(bands, count)):
-            block, first = self.own[: count - d, d], np.arange(count - d)
+            block: Float = self.own[: count - d, d]
+            first = np.arange(count - d, dtype=np.int64)
             if d == 0:
                 block = block + np.eye(length) * (damping * block + nothing)
-            for one, row, column in ((block, first + d, first), (np.swapaxes(block, 1, 2), first, first + d))[
-                : 2 if d else 1
-            ]:
-                blocks.append(one)
-                rows.append(row)
-                columns.append(column)
+            blocks.append(block)
+            rows.append(first + d)
+            columns.append(first)
+            if d:
+                blocks.append(np.swapaxes(block, 1, 2))
+                rows.append(first)
+                columns.append(first + d)
         row, column = np.concatenate(rows), np.concatenate(columns)
         order = np.lexsort((column, row))
         starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=count))])
@@ -224,7 +202,7 @@ class Normal:
         return csc_array(bsr_array((data, column[order], starts), shape=shape))
 
     def step(self, damping: float) -> tuple[Float, Float] | None:
-        """Marquardt's step of the shared (S,) and the own unknowns (T, L); None: needs more damping."""
+        """Marquardt's step of shared (S,) and own unknowns (T, L); None: more damping."""
         try:
             information, gradient, by_shared, by_own = self.eliminated(damping)
             # To a unit diagonal: pixels, radians and metres differ by orders of magnitude.

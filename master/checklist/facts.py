@@ -94,6 +94,11 @@ def beyond(value: float, show: float, clear: float) -> bool | None:
     return True if value >= show else False if value < clear else None
 
 
+def keys_of(items: Iterable[CheckItem]) -> list[tuple[str, str]]:
+    """Code and subject of each item: the numbers in sentences change all the time."""
+    return [(item.code, item.subject) for item in items]
+
+
 def plan_of(setups: Iterable[RigSetup]) -> Plan:
     """Who is to be there by these setups, one of each hand."""
     cameras: dict[str, CameraPlan] = {}
@@ -104,13 +109,11 @@ def plan_of(setups: Iterable[RigSetup]) -> Plan:
         if setup.has_markers:
             groups.append((setup.rig.cameras, len(setup.hand_markers)))
         for name, file in setup.cameras.items():
-            wrist = name in setup.wrist_cameras
-            before = cameras[name].hands if name in cameras else ()
-            hands = before if wrist else (*before, setup.hand_markers)
-            size = file.width_px, file.height_px
-            known = cameras[name].markers if name in cameras else ()
-            markers = tuple(dict.fromkeys((*known, *setup.markers)))
-            cameras[name] = CameraPlan(name, file.frame_rate_hz, size, wrist, hands, markers)
+            wrist, size_px = name in setup.wrist_cameras, (file.width_px, file.height_px)
+            before = cameras.get(name, CameraPlan(name, file.frame_rate_hz, size_px, wrist, ()))
+            hands = before.hands if wrist else (*before.hands, setup.hand_markers)
+            markers = tuple(dict.fromkeys((*before.markers, *setup.markers)))
+            cameras[name] = CameraPlan(name, file.frame_rate_hz, size_px, wrist, hands, markers)
     return Plan(tuple(cameras.values()), tuple(imus), tuple(groups))
 
 
@@ -159,62 +162,39 @@ class Window:
 class SlaveReports:
     """Push machine over the reports of one process."""
 
-    def __init__(self) -> None:
-        """Start with no report received."""
-        self._now: Health | None = None
-        self._before: Health | None = None
-        self._came_ns = 0
+    def __init__(self, health: Health, t_ns: int) -> None:
+        """Start with a first report, which came at `t_ns` [ns]."""
+        self.now = health  # the newest
         self.number = 0  # of comparisons: a rule looks at each once
+        self._before: Health | None = None
+        self._came_ns = t_ns
 
     def push(self, health: Health, t_ns: int) -> None:
         """Take a report that came at `t_ns` [ns]."""
-        now = self._now
         self._came_ns = t_ns
         # between two reports that are compared: an answer to a command may come just after one
         least_ns = 400_000_000
-        if now is None or health.session != now.session:
+        if health.session != self.now.session:
             self._before = None
-        elif health.t_ns - now.t_ns < least_ns:
+        elif health.t_ns - self.now.t_ns < least_ns:
             return
         else:
-            self._before = now
+            self._before = self.now
             self.number += 1
-        self._now = health
+        self.now = health
 
     def is_recent(self, t_ns: int) -> bool:
         """Whether the newest report is recent."""
         stale_ns = 3_000_000_000  # reports come twice a second; of an older one nothing is concluded
-        return self._now is not None and t_ns - self._came_ns < stale_ns
-
-    @property
-    def session(self) -> int | None:
-        """Session of the process that sent the newest report."""
-        return None if self._now is None else self._now.session
-
-    @property
-    def t_ns(self) -> int:
-        """When the newest report was made, on the slave's clock [ns]; 0: there is none."""
-        return 0 if self._now is None else self._now.t_ns
-
-    @property
-    def metrics(self) -> Mapping[str, float]:
-        """Quantity -> value, of the newest report."""
-        return {} if self._now is None else self._now.metrics
-
-    @property
-    def counts(self) -> Mapping[str, int]:
-        """Event -> how often, of the newest report."""
-        return {} if self._now is None else self._now.counts
+        return t_ns - self._came_ns < stale_ns
 
     def increase(self, event: str) -> int | None:
         """How often an event happened between the last two reports; None: not known."""
-        if self._now is None or self._before is None or event not in self._now.counts:
+        if self._before is None or event not in self.now.counts:
             return None
-        return max(self._now.counts[event] - self._before.counts.get(event, 0), 0)
+        return max(self.now.counts[event] - self._before.counts.get(event, 0), 0)
 
     @property
     def seconds(self) -> float:
         """Between the last two reports, on the slave's clock [s]; 0: there are no two."""
-        return (
-            0.0 if self._now is None or self._before is None else 1e-9 * (self._now.t_ns - self._before.t_ns)
-        )
+        return 0.0 if self._before is None else 1e-9 * (self.now.t_ns - self._before.t_ns)

@@ -19,7 +19,7 @@ from common.command_line import echo
 from common.errors import BusError, CalibrationError
 from common.messages import CheckItem, Checklist
 from common.messages.streams import MASTER
-from master.checklist.facts import CameraPlan, Plan
+from master.checklist.facts import CameraPlan, Plan, keys_of
 from master.run.process import join_bus
 
 ANSWER_S = 3.0  # a master reports once a second
@@ -34,7 +34,9 @@ def check(options: Namespace) -> int:
         items = newest(lists, options.bus)
         echo("\n".join(lines(items)))
         while options.watch:
-            items = _follow(lists, items, options.bus)
+            before, items = items, newest(lists, options.bus)
+            if keys_of(items) != keys_of(before):
+                echo("\n".join(["", *lines(items)]))
     except KeyboardInterrupt:
         pass
     finally:
@@ -59,14 +61,6 @@ def lines(items: tuple[CheckItem, ...]) -> list[str]:
     for item in items:
         out += [f"{item.code:<{wide}}  {item.subject}", f"  {item.sentence}", f"  -> {item.fix}"]
     return out
-
-
-def _follow(lists: Subscription, before: tuple[CheckItem, ...], where: str) -> tuple[CheckItem, ...]:
-    """Wait for a list; print it where it is another one."""
-    items = newest(lists, where)
-    if [(one.code, one.subject) for one in items] != [(one.code, one.subject) for one in before]:
-        echo("\n".join(["", *lines(items)]))
-    return items
 
 
 TOGETHER = timedelta(minutes=1)  # one calibration writes several parts, one after the other
@@ -97,9 +91,10 @@ class FileMonitor:
 
 def judge(calibration: Path, rigs: tuple[str, ...], plan: Plan) -> tuple[CheckItem, ...]:
     """What is wrong with the files of rigs; `plan` is what the files in use state."""
+    used = {one.name: one for one in plan.cameras}
     found: dict[tuple[str, str], CheckItem] = {}
     for name in rigs:
-        for item in _judge_rig(calibration, name, {one.name: one for one in plan.cameras}):
+        for item in _judge_rig(calibration, name, used):
             found.setdefault((item.code, item.subject), item)
     return tuple(found.values())
 

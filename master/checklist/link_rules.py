@@ -74,59 +74,16 @@ class LinkRules:
         for name, sender in now.senders.items():
             self._received.setdefault(name, _Received()).push(t_ns, sender)
         for camera in plan.cameras:
-            sender = now.senders.get(camera.name)
-            if sender is not None:
-                yield self._camera_absent(camera, sender, reports.get(camera.name), t_ns)
-                yield self._slow(camera, reports.get(camera.name), t_ns)
-                yield from self._way(camera.name, sender, t_ns)
-                yield from self._rejected_peers(camera.name, sender)
+            sender, report = now.senders[camera.name], reports.get(camera.name)
+            yield self._camera_absent(camera, sender, report, t_ns)
+            yield self._slow(camera, report, t_ns)
         for name in plan.imus:
-            sender = now.senders.get(name)
-            if sender is not None:
-                yield self._imu_silent(name, sender, t_ns)
-                yield from self._way(name, sender, t_ns)
-                yield from self._rejected_peers(name, sender)
+            yield self._imu_silent(name, now.senders[name], t_ns)
+        for name in (*(camera.name for camera in plan.cameras), *plan.imus):
+            yield from self._way(name, now.senders[name], t_ns)
+            yield from _rejected_peers(name, now.senders[name])
         if now.disk_free_mb is not None:
             yield disk_verdict("master", now.disk_free_mb)
-
-    def _rejected_peers(self, name: str, sender: SenderNow) -> Iterator[Verdict]:
-        """Yield a verdict for each process that claims to be `name` and is rejected."""
-        duplicate, unknown_peer = sender.duplicate, sender.unknown_peer
-        host = None if duplicate is None else duplicate.host
-        yield Verdict(
-            "duplicate_sender",
-            name,
-            duplicate is not None,
-            f"Two processes send as {name}; the one at {host} is ignored while the other works.",
-            "End one of them, or give it its own name (--name) and files.",
-        )
-        host, version = (None, None) if unknown_peer is None else unknown_peer
-        yield Verdict(
-            "version_mismatch",
-            name,
-            unknown_peer is not None,
-            f"{name} at {host} speaks wire version {version}, this master {WIRE_VERSION}: neither takes the other.",
-            "Install the same version of Phalanx on both, for example by phalanx fleet deploy.",
-        )
-        yield Verdict(
-            "secret_mismatch",
-            name,
-            sender.unproven is not None,
-            f"Somebody at {sender.unproven and sender.unproven.host} claims to be {name}, without the secret"
-            " that this master has for it.",
-            f"phalanx fleet deploy brings it, device-{name}.secret; both sides need --keys, or both the rig key alone."
-            " If that machine is not yours: phalanx fleet keys --revoke.",
-        )
-
-        yield Verdict(
-            "marker_mismatch",
-            name,
-            sender.markers is not None,
-            f"{name} sends {sender.markers and sender.markers.sent} markers, the rig of this master has"
-            f" {sender.markers and sender.markers.expected}: nothing of it is used.",
-            "Give both the same rig file: phalanx fleet deploy brings this one's to the slave; then restart the master"
-            " if the file here has changed since it began.",
-        )
 
     def _is_silent(self, name: str, sender: SenderNow, t_ns: int) -> bool | None:
         """Whether a sender is not received; with a grace period if it never was."""
@@ -143,24 +100,25 @@ class LinkRules:
         mute_ns = 1_200_000_000  # connected and nothing comes: the sensor is away
         return started and received.settled(t_ns) and t_ns - received.came_ns >= mute_ns
 
+    def _not_received(self, name: str) -> str:
+        return "is not received any more" if self._received[name].ever else "was never received"
+
     def _camera_absent(
         self, camera: CameraPlan, sender: SenderNow, reports: SlaveReports | None, t_ns: int
     ) -> Verdict:
         name, silent = camera.name, self._is_silent(camera.name, sender, t_ns)
-        if silent or silent is None:
-            never = not self._received[name].ever
+        if silent is not False:
             return Verdict(
                 "camera_absent",
                 name,
                 silent,
-                f"Camera {name} {'was never received' if never else 'is not received any more'}.",
+                f"Camera {name} {self._not_received(name)}.",
                 f"Is its slave running (phalanx-slave run --name {name}), on this network, with the same rig key?",
             )
+        mute = self._mute(name, t_ns)
         if camera.wrist:  # without a hand there are no strobe cycles: it is the frames that count
-            frames = None if reports is None or not reports.is_recent(t_ns) else reports.increase("frames")
-            mute = frames == 0 and self._mute(name, t_ns)
-        else:
-            mute = self._mute(name, t_ns)
+            recent = None if reports is None or not reports.is_recent(t_ns) else reports
+            mute = mute and recent is not None and recent.increase("frames") == 0
         return Verdict(
             "camera_absent",
             name,
@@ -170,21 +128,21 @@ class LinkRules:
         )
 
     def _imu_silent(self, name: str, sender: SenderNow, t_ns: int) -> Verdict:
-        silent, never = self._is_silent(name, sender, t_ns), not self._received[name].ever
-        if silent is False and self._mute(name, t_ns):
+        silent = self._is_silent(name, sender, t_ns)
+        if silent is not False:
             return Verdict(
                 "imu_silent",
                 name,
-                True,
-                f"The slave of IMU {name} is there, but no sample comes.",
-                "Is the IMU plugged in and switched on? The slave opens it again by itself; see its log.",
+                silent,
+                f"IMU {name} {self._not_received(name)}.",
+                f"Is its slave running (phalanx-slave run --name {name} --imu DRIVER), and the IMU plugged in?",
             )
         return Verdict(
             "imu_silent",
             name,
-            silent,
-            f"IMU {name} {'was never received' if never else 'is not received any more'}.",
-            f"Is its slave running (phalanx-slave run --name {name} --imu DRIVER), and the IMU plugged in?",
+            self._mute(name, t_ns),
+            f"The slave of IMU {name} is there, but no sample comes.",
+            "Is the IMU plugged in and switched on? The slave opens it again by itself; see its log.",
         )
 
     def _slow(self, camera: CameraPlan, reports: SlaveReports | None, t_ns: int) -> Verdict:
@@ -193,7 +151,7 @@ class LinkRules:
         if camera.wrist:
             if reports is not None and reports.is_recent(t_ns) and reports.number != received.report:
                 received.report = reports.number
-                received.frames.push(reports.t_ns, reports.counts.get("frames", 0))
+                received.frames.push(reports.now.t_ns, reports.now.counts.get("frames", 0))
                 if received.settled(t_ns) and received.frames.full and received.frames.moved:
                     rate_hz = received.frames.increase()[0] / received.frames.seconds
         elif received.settled(t_ns) and received.messages.full and received.messages.moved:
@@ -247,6 +205,45 @@ class LinkRules:
             f"The clock of {name} against the master's {reports}: its times are worth nothing for moving hands.",
             "The network is slow or uneven: use a cable; wait half a minute after it was mended.",
         )
+
+
+def _rejected_peers(name: str, sender: SenderNow) -> Iterator[Verdict]:
+    """Yield a verdict for each process that claims to be `name` and is rejected."""
+    duplicate, other = sender.duplicate, sender.unknown_peer
+    unproven, markers = sender.unproven, sender.markers
+    yield Verdict(
+        "duplicate_sender",
+        name,
+        duplicate is not None,
+        f"Two processes send as {name}; the one at {duplicate and duplicate.host} is ignored while the other works.",
+        "End one of them, or give it its own name (--name) and files.",
+    )
+    yield Verdict(
+        "version_mismatch",
+        name,
+        other is not None,
+        f"{name} at {other and other.host} speaks wire version {other and other.version}, this master {WIRE_VERSION}:"
+        " neither takes the other.",
+        "Install the same version of Phalanx on both, for example by phalanx fleet deploy.",
+    )
+    yield Verdict(
+        "secret_mismatch",
+        name,
+        unproven is not None,
+        f"Somebody at {unproven and unproven.host} claims to be {name}, without the secret"
+        " that this master has for it.",
+        f"phalanx fleet deploy brings it, device-{name}.secret; both sides need --keys, or both the rig key alone."
+        " If that machine is not yours: phalanx fleet keys --revoke.",
+    )
+    yield Verdict(
+        "marker_mismatch",
+        name,
+        markers is not None,
+        f"{name} sends {markers and markers.sent} markers, the rig of this master has"
+        f" {markers and markers.expected}: nothing of it is used.",
+        "Give both the same rig file: phalanx fleet deploy brings this one's to the slave; then restart the master"
+        " if the file here has changed since it began.",
+    )
 
 
 def disk_verdict(subject: str, free_mb: float) -> Verdict:

@@ -13,6 +13,8 @@ while changed files are read. Four things keep the list quiet:
 
 import threading
 from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
@@ -22,7 +24,7 @@ from common.errors import BusError
 from common.machine import Machine
 from common.messages import MAX_CHECKS, CheckCode, CheckItem, Checklist, Health
 from common.messages.streams import MASTER
-from master.checklist.facts import MasterNow, Plan, SenderNow, SlaveReports, Verdict, plan_of
+from master.checklist.facts import MasterNow, Plan, SenderNow, SlaveReports, Verdict, keys_of, plan_of
 from master.checklist.files import FileMonitor
 from master.checklist.link_rules import LinkRules
 from master.checklist.slave_rules import MovedRule, SlaveRules
@@ -38,37 +40,44 @@ HOLD_NS: dict[CheckCode, int] = {
     "camera_moved": 400_000_000,
     "clock_unsynchronised": 500_000_000,
 }
-_ABSENT: frozenset[CheckCode] = frozenset(("camera_absent", "imu_silent"))
-_COLOURS: frozenset[CheckCode] = frozenset(("marker_unseen", "background_in_range"))
-_LIGHT: frozenset[CheckCode] = frozenset(("exposure_drift",))
-_MOVED: frozenset[CheckCode] = frozenset(("camera_moved",))
-_NOT_TAKEN: frozenset[CheckCode] = frozenset(("duplicate_sender", "version_mismatch", "secret_mismatch"))
-_OF_SENDER: frozenset[CheckCode] = frozenset(CODES) - _ABSENT - _NOT_TAKEN - {"marker_mismatch"}
+_ABSENT: AbstractSet[CheckCode] = {"camera_absent", "imu_silent"}
+_COLOURS: AbstractSet[CheckCode] = {"marker_unseen", "background_in_range"}
+_LIGHT: AbstractSet[CheckCode] = {"exposure_drift"}
+_MOVED: AbstractSet[CheckCode] = {"camera_moved"}
+_RATE: AbstractSet[CheckCode] = {"rate_low"}
+_LOSS: AbstractSet[CheckCode] = {"packet_loss"}
+_REJECTED: AbstractSet[CheckCode] = {
+    "duplicate_sender",
+    "version_mismatch",
+    "secret_mismatch",
+    "marker_mismatch",
+}
+_OF_SENDER: AbstractSet[CheckCode] = frozenset(CODES) - _ABSENT - _REJECTED
 # Cause -> what is not reported of the same camera, its markers, or a group with it in it.
-_FOLLOWS: dict[CheckCode, frozenset[CheckCode]] = {
+_FOLLOWS: dict[CheckCode, AbstractSet[CheckCode]] = {
     "camera_absent": _OF_SENDER,
     "imu_silent": _OF_SENDER,
     "auto_mode": _COLOURS | _LIGHT | _MOVED,
     "exposure_drift": _COLOURS | _MOVED,
     "colour_collision": _COLOURS | _MOVED,
     "calibration_absent": _COLOURS | _LIGHT | _MOVED,
-    "background_in_range": frozenset[CheckCode](("marker_unseen", "camera_moved")),
+    "background_in_range": {"marker_unseen", "camera_moved"},
     "clock_unsynchronised": _MOVED,
-    "strobe_slipped": frozenset[CheckCode](("rate_low",)),
-    "too_hot": frozenset[CheckCode](("rate_low",)),
+    "strobe_slipped": _RATE,
+    "too_hot": _RATE,
     "version_mismatch": _ABSENT,
     "secret_mismatch": _ABSENT,
-    "marker_mismatch": _ABSENT | _COLOURS | frozenset[CheckCode](("rate_low", "packet_loss", "camera_moved")),
+    "marker_mismatch": _ABSENT | _COLOURS | _RATE | _LOSS | _MOVED,
 }
 
 
+@dataclass(slots=True)
 class _Latch:
     """Decides if one thing is wrong, and holds since when and what was reported."""
 
-    def __init__(self) -> None:
-        self.since_ns: int | None = None
-        self.shown = False
-        self.verdict: Verdict | None = None
+    since_ns: int | None = None
+    shown: bool = False
+    verdict: Verdict | None = None
 
     def push(self, verdict: Verdict, t_ns: int) -> None:
         if verdict.wrong is None:
@@ -102,8 +111,10 @@ class ChecklistMonitor:
 
     def push_health(self, health: Health, t_ns: int) -> None:
         """Take a report that came at `t_ns` [ns]; ignored where it is of no slave."""
-        if health.source in self._slaves:
-            self._reports.setdefault(health.source, SlaveReports()).push(health, t_ns)
+        if (reports := self._reports.get(health.source)) is not None:
+            reports.push(health, t_ns)
+        elif health.source in self._slaves:
+            self._reports[health.source] = SlaveReports(health, t_ns)
 
     def push(self, now: MasterNow) -> None:
         """Take what the master counted by now."""
@@ -186,15 +197,15 @@ class ChecklistPublisher:
         depth = 64  # reports of slaves that may wait for a look: 32 senders, twice a second
         self._reports = bus.subscribe("health", depth=depth)
         self._session, self._machine = session, Machine(writes_to)
-        self._published: tuple[CheckItem, ...] | None = None
+        self._published: list[tuple[str, str]] | None = None
         self._published_ns = 0
 
-    def work(self, stop: threading.Event, setups: Callable[[], Sequence[RigSetup]] | None) -> None:
+    def work(self, stop: threading.Event, setups: Callable[[], Sequence[RigSetup]]) -> None:
         """Look again and again until the stop; `setups` returns which are in use."""
         poll_s = 0.2
         while not stop.wait(poll_s):
             try:
-                self.look(None if setups is None else setups())
+                self.look(setups())
             except BusError:
                 if stop.is_set():
                     return  # the run has ended
@@ -203,10 +214,10 @@ class ChecklistPublisher:
                 # What a device reports may make a rule fail; the list goes on with the next report.
                 self._received.quarantine.note(MASTER, error)
 
-    def look(self, setups: Sequence[RigSetup] | None = None) -> tuple[CheckItem, ...]:
-        """Look once, publish where due; `setups` None: as before; BusError: bus closed."""
+    def look(self, setups: Sequence[RigSetup]) -> None:
+        """Look once at the setups in use, publish where due; BusError: bus closed."""
         t_ns = self._clock.now_ns()
-        if setups is not None and tuple(setups) != self._setups:
+        if tuple(setups) != self._setups:
             self._setups = tuple(setups)
             plan = plan_of(setups)
             if plan != self._plan:
@@ -217,32 +228,30 @@ class ChecklistPublisher:
         self._monitor.push(self._now(t_ns))
         items = self._monitor.look(t_ns)
         every_ns = 1_000_000_000  # and at once where it changes
-        if _keys(items) != _keys(self._published) or t_ns - self._published_ns >= every_ns:
-            self._published, self._published_ns = items, t_ns
+        if keys_of(items) != self._published or t_ns - self._published_ns >= every_ns:
+            self._published, self._published_ns = keys_of(items), t_ns
             self._bus.publish("checklist", MASTER, Checklist(MASTER, self._session, t_ns, items))
-        return items
 
     def _now(self, t_ns: int) -> MasterNow:
-        connected = self._received.connected
-        rejected_peers, markers = self._received.rejected_peers(), self._received.marker_counts()
-        names = (*(camera.name for camera in self._plan.cameras), *self._plan.imus)
-        senders: dict[str, SenderNow] = {}
-        for name in names:
-            counts, clock = self._received.counts_of(name), self._received.clock_of(name)
-            sigma_ns = None if clock is None else clock.sigma_at(t_ns)
-            missed = counts.lost + counts.late
-            duplicate, unknown_peer, unproven = (of.get(name) for of in rejected_peers)
-            links = name in connected, counts.received, missed, sigma_ns, duplicate, unknown_peer, unproven
-            senders[name] = SenderNow(*links, markers.get(name))
+        received, senders = self._received, dict[str, SenderNow]()
+        connected, markers = received.connected, received.marker_counts()
+        duplicates, versions, unproven = received.rejected_peers()
+        for name in (*(camera.name for camera in self._plan.cameras), *self._plan.imus):
+            counts, clock = received.counts_of(name), received.clock_of(name)
+            senders[name] = SenderNow(
+                name in connected,
+                counts.received,
+                counts.lost + counts.late,
+                None if clock is None else clock.sigma_at(t_ns),
+                duplicates.get(name),
+                versions.get(name),
+                unproven.get(name),
+                markers.get(name),
+            )
         groups = [
             line.counts
             for setup, line in zip(self._setups, self._pipelines, strict=True)
             if setup.has_markers
         ]
         found = () if self._files is None else self._files.look(self._plan)
-        return MasterNow(self._received.started, senders, groups, self._machine.disk_free_mb(), found)
-
-
-def _keys(items: tuple[CheckItem, ...] | None) -> list[tuple[str, str]] | None:
-    """Code and subject of each item: the numbers in sentences change all the time."""
-    return None if items is None else [(item.code, item.subject) for item in items]
+        return MasterNow(received.started, senders, groups, self._machine.disk_free_mb(), found)

@@ -11,6 +11,7 @@ Only time counts in which at least three others (all, of a hand with fewer) are 
 """
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from math import log
 
 from common.calibration.camera_settings import WANTED
@@ -22,17 +23,36 @@ COLOUR = "colour."  # metrics of the slave: a number that changes with the range
 SEEN = "seen."
 
 
+@dataclass(slots=True)
 class _Marker:
-    def __init__(self) -> None:
-        self.colour: float | None = None
-        self.ever = self.before_change = False
-        self.without_s = 0.0
+    """When a marker was seen: ever with its present colours, or with those before."""
+
+    colour: float | None = None
+    ever: bool = False
+    before_change: bool = False
+    without_s: float = 0.0
 
     @property
     def limit_s(self) -> float:
         """How long it may be missing."""
         changed_s, never_s = 0.9, 5.0
         return GONE_S if self.ever else changed_s if self.before_change else never_s
+
+    @property
+    def since(self) -> str:
+        """How long it has been missing, in words."""
+        if self.ever:
+            return f"for {self.without_s:.0f} s"
+        return f"not once since its {'colours were changed' if self.before_change else 'slave began'}"
+
+    def recoloured(self, colour: float | None) -> bool:
+        """Store the marker's colour; True: it changed, and the timing starts again."""
+        changed = self.colour is not None and colour is not None and colour != self.colour
+        if changed:
+            self.before_change |= self.ever
+            self.ever, self.without_s = False, 0.0
+        self.colour = colour
+        return changed
 
 
 class UnseenMarkers:
@@ -46,18 +66,17 @@ class UnseenMarkers:
 
     def push(self, reports: SlaveReports) -> Iterator[Verdict]:
         """Take the newest report."""
-        if reports.session != self._session:
-            self._session = reports.session
+        if reports.now.session != self._session:
+            self._session = reports.now.session
             self._markers = {name: _Marker() for name in self._markers}
         frames = reports.increase("frames")
         if not frames:
             return
         share = {name: (reports.increase(SEEN + name) or 0) / frames for name in self._markers}
-        others = 3
+        others, half = 3, 0.5  # of the frames between two reports
         needed = min(others, len(share) - 1)
         for name, one in self._markers.items():
-            half = 0.5  # of the frames between two reports
-            if self._recoloured(one, reports.metrics.get(COLOUR + name)):
+            if one.recoloured(reports.now.metrics.get(COLOUR + name)):
                 pass  # of the frames of this report some were looked at with the colours of before
             elif share[name]:
                 one.ever, one.without_s = True, 0.0
@@ -67,29 +86,11 @@ class UnseenMarkers:
                 "marker_unseen",
                 f"{self._camera}.{name}",
                 one.without_s >= one.limit_s,
-                f"Camera {self._camera} does not find marker {name}, {_since(one)}, though it finds others.",
+                f"Camera {self._camera} does not find marker {name}, {one.since}, though it finds others.",
                 "Show it to the camera. If it is in the picture: clean or repaint it, or calibrate its colours.",
                 (self._camera,),
                 (name,),
             )
-
-    @staticmethod
-    def _recoloured(one: _Marker, colour: float | None) -> bool:
-        """Store the marker's colour; True: it changed, and the timing starts again."""
-        changed = one.colour is not None and colour is not None and colour != one.colour
-        if changed:
-            one.before_change = one.ever or one.before_change
-            one.ever, one.without_s = False, 0.0
-        one.colour = colour
-        return changed
-
-
-def _since(one: _Marker) -> str:
-    if one.ever:
-        return f"for {one.without_s:.0f} s"
-    return (
-        "not once since its colours were changed" if one.before_change else "not once since its slave began"
-    )
 
 
 # Setting -> relative and absolute distance from which what is read back is another setting. Cameras round exposure to
@@ -144,7 +145,7 @@ class SlaveRules:
 
 def _settings(name: str, reports: SlaveReports) -> Iterator[Verdict]:
     """Check that the camera has the settings that were requested."""
-    metrics = reports.metrics
+    metrics = reports.now.metrics
     wrong: list[str] = []
     for setting, (share, least) in OFF.items():
         want, got = metrics.get(WANTED + setting), metrics.get(setting)
@@ -170,7 +171,7 @@ def _settings(name: str, reports: SlaveReports) -> Iterator[Verdict]:
 
 def _light(name: str, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether the picture is as bright as at calibration."""
-    exposure = reports.metrics.get("light_exposure")
+    exposure = reports.now.metrics.get("light_exposure")
     if exposure is None or exposure <= 0.0:
         return
     # against calibration, either way; the slave follows up to 2.5 (docs/light.md)
@@ -187,15 +188,15 @@ def _light(name: str, reports: SlaveReports) -> Iterator[Verdict]:
 def _collisions(camera: CameraPlan, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether two markers share colours, by their ranges or by their looks."""
     name = camera.name
-    for metric, hues in reports.metrics.items():
-        if metric.startswith(OVERLAP):
-            pair = tuple(metric.removeprefix(OVERLAP).split(BETWEEN))
-            what = f"the colour ranges of {' and '.join(pair)} overlap by {hues:.0f} hues"
-        elif metric.startswith(ALIKE):
-            pair = tuple(metric.removeprefix(ALIKE).split(BETWEEN))
-            what = f"{' and '.join(pair)} look alike, {hues:.0f} hues apart"
-        else:
+    for metric, hues in reports.now.metrics.items():
+        if not metric.startswith((OVERLAP, ALIKE)):
             continue
+        overlap = metric.startswith(OVERLAP)
+        pair = tuple(metric.removeprefix(OVERLAP if overlap else ALIKE).split(BETWEEN))
+        both = " and ".join(pair)
+        what = f"the colour ranges of {both} overlap by {hues:.0f} hues"
+        if not overlap:
+            what = f"{both} look alike, {hues:.0f} hues apart"
         if len(pair) != 2 or not {*camera.markers}.issuperset(pair):
             continue
         yield Verdict(
@@ -212,7 +213,7 @@ def _collisions(camera: CameraPlan, reports: SlaveReports) -> Iterator[Verdict]:
 def _file(camera: CameraPlan, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether the slave has colours, and a file of the same camera as the master's."""
     name = camera.name
-    bare = tuple(marker for marker in camera.markers if UNCOLOURED + marker in reports.counts)
+    bare = tuple(marker for marker in camera.markers if UNCOLOURED + marker in reports.now.counts)
     yield Verdict(
         "calibration_absent",
         name,
@@ -222,7 +223,7 @@ def _file(camera: CameraPlan, reports: SlaveReports) -> Iterator[Verdict]:
         (name,),
         bare,
     )
-    width, height = reports.metrics.get("width_px"), reports.metrics.get("height_px")
+    width, height = reports.now.metrics.get("width_px"), reports.now.metrics.get("height_px")
     if width is None or height is None:
         return
     yield Verdict(
@@ -242,10 +243,10 @@ def _background(camera: CameraPlan, reports: SlaveReports) -> Iterator[Verdict]:
         return
     for marker in camera.markers:
         event = AMBIGUOUS + marker
-        if event not in reports.counts:
+        if event not in reports.now.counts:
             continue
         share = (reports.increase(event) or 0) / frames
-        u, v = reports.metrics.get(f"{event}.u"), reports.metrics.get(f"{event}.v")
+        u, v = reports.now.metrics.get(f"{event}.u"), reports.now.metrics.get(f"{event}.v")
         where = "" if u is None or v is None else f", near pixel {u:.0f}, {v:.0f}"
         ambiguous_share, ambiguous_well = 0.5, 0.1  # of the frames
         yield Verdict(
@@ -284,7 +285,7 @@ def _strobe(name: str, reports: SlaveReports) -> Iterator[Verdict]:
 
 def _machine(name: str, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether the slave's computer is hot, throttled, or its disk full."""
-    metrics = reports.metrics
+    metrics = reports.now.metrics
     now, limit = metrics.get("temperature_c"), metrics.get("temperature_limit_c")
     hot: bool | None = False
     why: list[str] = []

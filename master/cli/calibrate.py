@@ -19,6 +19,7 @@ from master.commands.options import (
     add_path,
     add_picture,
     add_recording_rig,
+    add_results,
     add_rig,
     add_text,
 )
@@ -26,21 +27,10 @@ from master.commands.options import (
 
 def add_board(command: ArgumentParser, size: str | None = None, square_mm: float | None = None) -> None:
     """The board; without a usual size and square they have to be given."""
-    command.add_argument(
-        "--board",
-        required=size is None,
-        default=size,
-        metavar="COLUMNSxROWS",
-        help="inner corners of a checkerboard, squares of a ChArUco board (--marker-mm)" + _usual(size),
-    )
-    command.add_argument(
-        "--square-mm",
-        type=number(),
-        required=square_mm is None,
-        default=square_mm,
-        metavar="MM",
-        help="side of a square, measured on the print" + _usual(square_mm),
-    )
+    shape = "inner corners of a checkerboard, squares of a ChArUco board (--marker-mm)"
+    add_text(command, "--board", "COLUMNSxROWS", shape, required=size is None, default=size)
+    side, given = "side of a square, measured on the print", square_mm is not None
+    add_number(command, "--square-mm", "MM", side, required=not given, default=square_mm)
     add_markers_of_board(command)
 
 
@@ -55,13 +45,10 @@ def add_dictionary(command: ArgumentParser) -> None:
     add_text(command, "--dictionary", "NAME", "family of its markers", default="4X4_50")
 
 
-def add_pictures(command: ArgumentParser) -> None:
-    """The pictures of a board."""
+def add_board_pictures(command: ArgumentParser) -> None:
+    """The pictures of a board, the board, and which cameras."""
     add_path(command, "source", "SOURCE", "folder: CAMERA*.png|jpg, or a folder per camera, or a recording")
-
-
-def add_cameras(command: ArgumentParser) -> None:
-    """Which cameras."""
+    add_board(command)
     add_names(command, "--camera", "NAME", "a camera; once for each (default: all that have images)")
 
 
@@ -96,10 +83,6 @@ def add_sweep(command: ArgumentParser) -> None:
     add_number(
         command, "--fov-deg", "DEG", "nominal horizontal field of view, for cameras without intrinsics"
     )
-
-
-def _usual(value: object) -> str:
-    return "" if value is None else f" (default: {value})"
 
 
 def board(command: ArgumentParser) -> None:
@@ -141,14 +124,10 @@ def intrinsics(command: ArgumentParser) -> None:
       phalanx calibrate cameras intrinsics views --board 9x6 --square-mm 25 --out calib_json
       phalanx calibrate cameras intrinsics views --camera left --board 7x5 --square-mm 30 --marker-mm 22
     """
-    add_pictures(command)
-    add_board(command)
-    add_cameras(command)
+    add_board_pictures(command)
     add_board_shape(command)
     add_calibration(command)
-    add_out(command)
-    add_json(command)
-    add_picture(command, "corners and residuals")
+    add_results(command, "corners and residuals")
 
 
 def stereo(command: ArgumentParser) -> None:
@@ -163,16 +142,12 @@ def stereo(command: ArgumentParser) -> None:
       phalanx calibrate cameras stereo views --board 9x6 --square-mm 25 --rig desk --out calib_json
       phalanx calibrate cameras stereo views --camera left --camera right --board 9x6 --square-mm 25 --keep-intrinsics
     """
-    add_pictures(command)
-    add_board(command)
-    add_cameras(command)
+    add_board_pictures(command)
     add_text(command, "--rig", "NAME", "name of the rig's file, without .json", default="desk")
     add_flag(command, "--keep-intrinsics", "keep the lenses that the camera files have")
     add_board_shape(command)
     add_calibration(command)
-    add_out(command)
-    add_json(command)
-    add_picture(command, "corners and residuals")
+    add_results(command, "corners and residuals")
 
 
 def capture(command: ArgumentParser) -> None:

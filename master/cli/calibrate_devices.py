@@ -14,8 +14,8 @@ from master.commands.options import (
     add_number,
     add_out,
     add_path,
-    add_picture,
     add_recording_rig,
+    add_results,
     add_text,
 )
 
@@ -28,6 +28,13 @@ def add_lit_views(command: ArgumentParser) -> None:
         "SOURCE",
         "a recording, or a folder of VIEW_ambient.png, VIEW_laser.png and, if there are, VIEW_led.png",
     )
+
+
+def add_detected(command: ArgumentParser, motion: str, cameras: str = "it") -> None:
+    """A recorded motion, and what was detected in it."""
+    add_path(command, "recording", "RECORDING", f"folder of a recording{motion}")
+    text = f"folder with detections_<camera>.npz of {cameras}, from `replay --detect-only`"
+    add_path(command, "--detections", "DIR", text, required=True)
 
 
 def laser_plane(command: ArgumentParser) -> None:
@@ -46,9 +53,7 @@ def laser_plane(command: ArgumentParser) -> None:
     add_board(command)
     add_recording_rig(command)
     add_calibration(command)
-    add_out(command)
-    add_json(command)
-    add_picture(command, "the lines and what is left of them")
+    add_results(command, "the lines and what is left of them")
 
 
 def flat_field(command: ArgumentParser) -> None:
@@ -68,9 +73,7 @@ def flat_field(command: ArgumentParser) -> None:
     add_board(command)
     add_recording_rig(command)
     add_calibration(command)
-    add_out(command)
-    add_json(command)
-    add_picture(command, "the flat field and its residuals")
+    add_results(command, "the flat field and its residuals")
 
 
 def curl(command: ArgumentParser) -> None:
@@ -85,19 +88,10 @@ def curl(command: ArgumentParser) -> None:
       phalanx replay RECORDING --detect-only --calibration calib_json --out found
       phalanx calibrate wrist curl RECORDING --detections found --rig wrist --out calib_json --picture curl.png
     """
-    add_path(command, "recording", "RECORDING", "folder of a recording: a hand that curls slowly")
-    add_path(
-        command,
-        "--detections",
-        "DIR",
-        "folder with detections_<camera>.npz of it, from `replay --detect-only`",
-        required=True,
-    )
+    add_detected(command, ": a hand that curls slowly")
     add_recording_rig(command)
     add_calibration(command)
-    add_out(command)
-    add_json(command)
-    add_picture(command, "points and lines")
+    add_results(command, "points and lines")
 
 
 def palm(command: ArgumentParser) -> None:
@@ -158,21 +152,12 @@ def subject(command: ArgumentParser) -> None:
       phalanx replay RECORDING --detect-only --calibration calib_json --out found
       phalanx calibrate wrist subject RECORDING --detections found --rig wrist --name me --out calib_json
     """
-    add_path(command, "recording", "RECORDING", "folder of a recording: the guided motion")
-    add_path(
-        command,
-        "--detections",
-        "DIR",
-        "folder with detections_<camera>.npz of it, from `replay --detect-only`",
-        required=True,
-    )
+    add_detected(command, ": the guided motion")
     add_path(command, "--hand", "FILE", "hand file; default: the rig's `hand` in CALIBRATION/hands")
     add_text(command, "--name", "NAME", "of the new hand file; default: that of the hand file")
     add_recording_rig(command)
     add_calibration(command)
-    add_out(command)
-    add_json(command)
-    add_picture(command, "what was seen and fitted")
+    add_results(command, "what was seen and fitted")
 
 
 def extrinsics(command: ArgumentParser) -> None:
@@ -188,20 +173,11 @@ def extrinsics(command: ArgumentParser) -> None:
       phalanx replay RECORDING --detect-only --calibration calib_json --out found
       phalanx calibrate wrist extrinsics RECORDING --detections found --out calib_json
     """
-    add_path(command, "recording", "RECORDING", "folder of a recording of kind `both`: the joint motion")
-    add_path(
-        command,
-        "--detections",
-        "DIR",
-        "folder with detections_<camera>.npz of all its cameras, from `replay --detect-only`",
-        required=True,
-    )
+    add_detected(command, " of kind `both`: the joint motion", "all its cameras")
     add_path(command, "--hand", "FILE", "hand file; default: the marker rig's `hand` in CALIBRATION/hands")
     add_recording_rig(command)
     add_calibration(command)
-    add_out(command)
-    add_json(command)
-    add_picture(command, "what was seen and fitted")
+    add_results(command, "what was seen and fitted")
 
 
 def tracker(command: ArgumentParser) -> None:
@@ -234,9 +210,7 @@ def tracker(command: ArgumentParser) -> None:
         default=90.0,
     )
     add_path(command, "--keep", "FILE", "keep the live motion in this .npz")
-    add_out(command)
-    add_json(command)
-    add_picture(command, "what was seen and left")
+    add_results(command, "what was seen and left")
     add_bus(command)
 
 
@@ -323,7 +297,5 @@ def object_options(command: ArgumentParser) -> None:
         number(5.0),
         default=60.0,
     )
-    add_out(command)
-    add_json(command)
-    add_picture(command, "beads and residuals")
+    add_results(command, "beads and residuals")
     add_bus(command)

@@ -71,13 +71,8 @@ def console(command: ArgumentParser) -> None:
     add_number(
         command, "--port", "PORT", "TCP port of the page; 0: a free one", whole(0, 65535), default=8080
     )
-    command.add_argument(
-        "--host",
-        default="127.0.0.1",
-        metavar="ADDRESS",
-        help="address to serve on; elsewhere than on this machine the page asks for a password (default: "
-        "%(default)s)",
-    )
+    host = "address to serve on; elsewhere than on this machine the page asks for a password"
+    add_text(command, "--host", "ADDRESS", host, default="127.0.0.1")
     add_path(
         command,
         "--password-file",

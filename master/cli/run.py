@@ -113,6 +113,12 @@ def replay(command: ArgumentParser) -> None:
       phalanx replay RECORDING --detections found --out out/again    solves what was detected before
       phalanx replay out/wave.mcap --out out/wave                    recorded messages
     """
+    _what_is_replayed(command)
+    _what_is_detected(command)
+    _how_it_is_solved(command)
+
+
+def _what_is_replayed(command: ArgumentParser) -> None:
     add_path(
         command,
         "paths",
@@ -135,6 +141,9 @@ def replay(command: ArgumentParser) -> None:
         "rigs that is solved (default: all)",
     )
     add_path(command, "--times", "FILE.csv", "of videos: when each frame was taken; camera,frame,time")
+
+
+def _what_is_detected(command: ArgumentParser) -> None:
     add_path(command, "--out", "DIR", "folder for the results", required=True)
     which = command.add_mutually_exclusive_group()
     which.add_argument(
@@ -148,6 +157,9 @@ def replay(command: ArgumentParser) -> None:
         action="store_true",
         help="write detections_CAMERA.npz, and solve nothing: cameras need no geometry",
     )
+
+
+def _how_it_is_solved(command: ArgumentParser) -> None:
     add_path(
         command,
         "--calibration",
@@ -200,21 +212,10 @@ def record(command: ArgumentParser) -> None:
     add_hand(command)
     add_number(command, "--seconds", "S", "length (default: until Ctrl-C)", number(0.0))
     add_bus(command)
-    command.add_argument(
-        "--frames",
-        type=number(0.0, 30.0),
-        default=0.0,
-        metavar="HZ",
-        help="keep whole frames of each camera, so many a second (default: %(default)g)",
-    )
+    frames = "keep whole frames of each camera, so many a second"
+    add_number(command, "--frames", "HZ", frames, number(0.0, 30.0), default=0.0)
     add_flag(command, "--previews", "keep the small pictures of the cameras")
-    command.add_argument(
-        "--reserve-mb",
-        type=number(0.0),
-        default=200.0,
-        metavar="MB",
-        help="stay free on the disk (default: %(default)g)",
-    )
+    add_number(command, "--reserve-mb", "MB", "stay free on the disk", number(0.0), default=200.0)
     add_flag(
         command, "--raw", "have every slave with --raw-folder keep its raw frames, in DIR/FILE'S NAME-CAMERA"
     )
@@ -267,6 +268,12 @@ def export(command: ArgumentParser) -> None:
       phalanx export out/me/poses.npz --compare motive.csv --side right --json errors.json
       phalanx export out/demo/poses.npz --compare truth.csv --aligned
     """
+    _source_and_target(command)
+    _hands_and_rigs(command)
+    _motion_and_comparison(command)
+
+
+def _source_and_target(command: ArgumentParser) -> None:
     add_path(command, "source", "SOURCE", "poses.npz of a run or a replay, or an .mcap recording")
     add_choice(
         command,
@@ -288,6 +295,9 @@ def export(command: ArgumentParser) -> None:
         help="file of the first hand, or folder. What else there is stands beside it, with a name behind its own: of "
         "another hand, object_NAME, contact_HAND_NAME, gestures (default: beside SOURCE)",
     )
+
+
+def _hands_and_rigs(command: ArgumentParser) -> None:
     add_names(command, "--only", "NAME", "this hand; once for each (default: all)")
     add_path(
         command,
@@ -305,6 +315,9 @@ def export(command: ArgumentParser) -> None:
         "of an rrd: rig of CALIBRATION/rigs; an .mcap knows its own; once for each. Of --compare: whose markers "
         "the poses have",
     )
+
+
+def _motion_and_comparison(command: ArgumentParser) -> None:
     add_number(
         command,
         "--rate",

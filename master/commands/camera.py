@@ -2,6 +2,7 @@
 
 import time
 from argparse import Namespace
+from contextlib import closing
 from pathlib import Path
 
 import msgspec
@@ -29,11 +30,8 @@ def camera(options: Namespace) -> None:
         options.exposure_us, options.gain, options.colour_gains, options.rate_hz, options.roi_margin
     )
     steps = commands(options.name, wanted, options.pick, options.load_file, options.save)
-    connection = join_bus(options.bus)
-    try:
-        health = send_all(connection, steps)
-    finally:
-        connection.close()
+    with closing(join_bus(options.bus)) as bus:
+        health = send_all(bus, steps)
     echo("\n".join(table(health)))
 
 
@@ -97,11 +95,7 @@ def send_all(bus: Bus, steps: list[Command]) -> Health:
         BusError: No such camera is on the bus, or it refused; what was set before stays.
     """
     _appear(bus, steps[0].target)
-    health: Health | None = None
-    for step in steps:
-        health = bus.ask(step, ANSWER_S)
-    assert health is not None  # there is at least one step
-    return health
+    return [bus.ask(step, ANSWER_S) for step in steps][-1]
 
 
 def table(health: Health) -> list[str]:
@@ -150,9 +144,8 @@ def _pick(text: str) -> ColourPick:
 def _pair(text: str | None) -> tuple[float, float] | None:
     if text is None:
         return None
-    parts = text.split(",")
     try:
-        red, blue = (float(part) for part in parts)
+        red, blue = (float(part) for part in text.split(","))
     except ValueError as error:
         raise PhalanxError(f"--colour-gains {text}: write RED,BLUE, for example 1.1,1.6") from error
     for value in (red, blue):

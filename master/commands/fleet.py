@@ -12,6 +12,7 @@ import threading
 import time
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -40,10 +41,8 @@ def wait_for_senders(options: Namespace) -> int:
     seconds = options.seconds or 20.0
     connection = _running(options.bus)
     if connection is not None:
-        try:
+        with closing(connection):
             received = at_master(connection, names, seconds, stop)
-        finally:
-            connection.close()
     else:
         setup = load(options.calibration / "rigs" / f"{options.rig}.json", RigCalibration)
         received = here(names, setup, link_key(os.environ, options.key_file), address(options.beacon, "--beacon"),
@@ -109,10 +108,8 @@ def here(
         ingest = Ingest(rig.cameras, key, SystemClock(), beacon, bind, "", 1.0, imus=imus, wrists=wrists)
     except BusError as error:
         raise BusError(f"{error}; if a master runs here, give its address: --bus ENDPOINT") from error
-    try:
+    with closing(ingest):
         return _counted(ingest, names, seconds, stop)
-    finally:
-        ingest.close()
 
 
 def _counted(ingest: Ingest, names: Sequence[str], seconds: float, stop: threading.Event) -> Received:
@@ -154,7 +151,7 @@ def _running(endpoint: str) -> ZenohBus | None:
 
 _HEAD = ("device", "host", "version", "temperature", "throttled", "rate", "clock offset", "state")
 _HOME = "\x1b[H\x1b[J"  # to the top of the screen, and clear it
-USUAL_KEYS = ".config/phalanx/keys"  # where `phalanx fleet deploy` makes them
+DEFAULT_KEYS = ".config/phalanx/keys"  # where `phalanx fleet deploy` makes them
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,15 +212,12 @@ class Roll:
             return Device(name, known, rate_hz=rate, offset_us=clock[0], sigma_us=clock[1])
         silent_s = 3.0  # three reports
         silent = now_s - self._at[name] > silent_s
-        state = (
-            "silent"
-            if silent and not rate
-            else "running"
-            if name == MASTER or self._is_program(name)
-            else "streaming"
-            if rate
-            else "waiting"
-        )
+        if silent and not rate:
+            state = "silent"
+        elif name == MASTER or self._is_program(name):
+            state = "running"
+        else:
+            state = "streaming" if rate else "waiting"
         metrics = own.metrics
         throttled = metrics.get("throttled")
         return Device(
@@ -258,29 +252,30 @@ def status(options: Namespace) -> int:
     Raises:
         UsageError: `--wait` and `--watch` are both given.
     """
-    _use_usual_keys(options)
+    _use_default_keys(options)
     if options.wait:
         if options.watch:
             raise UsageError("--watch has no meaning with --wait: leave it out")
         return wait_for_senders(options)
-    show = _as_json if options.as_json else _as_table if not options.watch else _on_screen
+
+    def show(devices: Sequence[Device]) -> str:
+        if options.as_json:
+            return json.dumps({"devices": [asdict(one) for one in devices]})
+        return (_HOME if options.watch else "") + "\n".join(table(devices))
+
     period_s = 1.0 if options.watch else options.seconds or 3.0
-    connection = join_bus(options.bus)
-    try:
-        _listen(
-            connection, Roll(expected_devices(os.environ)), period_s, options.watch, stop_on_signals(), show
-        )
-    finally:
-        connection.close()
+    with closing(join_bus(options.bus)) as bus:
+        roll = Roll(expected_devices(os.environ))
+        _listen(bus, roll, period_s, options.watch, stop_on_signals(), show)
     return 0
 
 
-def _use_usual_keys(options: Namespace) -> None:
+def _use_default_keys(options: Namespace) -> None:
     """Use the keys folder of deployments, where no other is named."""
-    typical, bus = Path.home() / USUAL_KEYS, bus_end(HERE_BUS)
-    if FOLDER in os.environ or not typical.is_dir():
+    folder, bus = Path.home() / DEFAULT_KEYS, bus_end(HERE_BUS)
+    if FOLDER in os.environ or not folder.is_dir():
         return
-    os.environ[FOLDER] = str(typical)
+    os.environ[FOLDER] = str(folder)
     if options.bus == bus:
         options.bus = bus_end(HERE_BUS)
 
@@ -299,28 +294,12 @@ def _row(device: Device) -> tuple[str, ...]:
         device.name,
         device.host or "-",
         device.version or "-",
-        _number(device.temperature_c, "{:.0f} °C"),
-        "-" if device.throttled is None else "yes" if device.throttled else "no",
-        _number(device.rate_hz, "{:.1f}/s"),
+        "-" if device.temperature_c is None else f"{device.temperature_c:.0f} °C",
+        {None: "-", True: "yes", False: "no"}[device.throttled],
+        "-" if device.rate_hz is None else f"{device.rate_hz:.1f}/s",
         "-" if device.offset_us is None else f"{device.offset_us:+.0f} ± {device.sigma_us or 0.0:.0f} µs",
         device.state,
     )
-
-
-def _number(value: float | None, form: str) -> str:
-    return "-" if value is None else form.format(value)
-
-
-def _as_json(devices: Sequence[Device]) -> str:
-    return json.dumps({"devices": [asdict(one) for one in devices]})
-
-
-def _as_table(devices: Sequence[Device]) -> str:
-    return "\n".join(table(devices))
-
-
-def _on_screen(devices: Sequence[Device]) -> str:
-    return _HOME + _as_table(devices)
 
 
 def _listen(

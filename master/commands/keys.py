@@ -17,9 +17,9 @@ import threading
 from argparse import Namespace
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack, closing
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from common.bus.bus import Bus, Subscription
 from common.bus.keys import (
@@ -45,9 +45,6 @@ from common.machine import program
 from common.messages import Command, Health
 from common.messages.streams import sender_of
 from master.run.process import bus_of_master, stop_on_signals
-
-if TYPE_CHECKING:
-    from common.bus.zenoh_bus import ZenohBus
 
 AUTHORITY_KEY = "ca.key"
 _ENDINGS = ("pem", "key", "secret")
@@ -116,11 +113,10 @@ def renew(folder: Path, now: datetime, without: Iterable[str] = ()) -> list[str]
     Raises:
         PhalanxError: No such folder or device; it cannot be written.
     """
-    names = devices_of(folder)
-    for name in (gone := list(without)):
-        if name not in names:
-            raise PhalanxError(f"{folder}: no device {name!r}; there are: {', '.join(names) or 'none'}")
-    left = [name for name in names if name not in gone]
+    gone = list(without)
+    for name in gone:
+        _check_device(folder, name)
+    left = [name for name in devices_of(folder) if name not in gone]
     try:
         with tempfile.TemporaryDirectory(
             prefix=".new.", dir=folder
@@ -145,8 +141,7 @@ def renew_device(folder: Path, name: str, now: datetime) -> None:
     Raises:
         PhalanxError: No such folder or device; it cannot be written. The old one is still there then.
     """
-    if name not in (names := devices_of(folder)):
-        raise PhalanxError(f"{folder}: no device {name!r}; there are: {', '.join(names) or 'none'}")
+    _check_device(folder, name)
     place = folder / DEVICES / name
     try:
         pair = issue(_authority(folder), name, now)
@@ -167,6 +162,11 @@ def devices_of(folder: Path) -> list[str]:
             f"{folder}: no keys folder (no {AUTHORITY_KEY}): phalanx fleet keys {folder} --make"
         )
     return sorted(path.stem for path in (folder / DEVICES).glob("*.pem"))
+
+
+def _check_device(folder: Path, name: str) -> None:
+    if name not in (names := devices_of(folder)):
+        raise PhalanxError(f"{folder}: no device {name!r}; there are: {', '.join(names) or 'none'}")
 
 
 def files_of_device(name: str) -> tuple[str, ...]:
@@ -393,51 +393,33 @@ def relay(options: Namespace) -> None:
     if options.connect:
         raise UsageError("--connect is for --listen")
     stop = stop_on_signals()
-    below = bus_of_master(
-        options.bus, stop, lambda error: _notify("relay", f"waiting for the master: {error}")
-    )
-    if below is None:
-        return
-    try:
-        above = bus_of_master(
-            options.router,
-            stop,
-            lambda error: _notify("relay", f"waiting for the router: {error}"),
-            options.site,
+    with ExitStack() as stack:
+        below = bus_of_master(
+            options.bus, stop, lambda error: echo(f"relay: waiting for the master: {error}")
         )
-        if above is not None:
-            _repeat(below, above, options.site, stop)
-    finally:
-        below.close()
+        if below is None:
+            return
+        stack.callback(below.close)
+        above = bus_of_master(
+            options.router, stop, lambda error: echo(f"relay: waiting for the router: {error}"), options.site
+        )
+        if above is None:
+            return
+        stack.callback(above.close)
+        repeats = Relay(below, above, SystemClock())
+        stack.callback(repeats.close)
+        echo(f"relay: repeating as {options.site}")
+        repeats.report(lambda line: echo(f"relay: {line}"), stop)
 
 
 def _route(listen: str, connect: Sequence[str]) -> None:
     stop = stop_on_signals()
     from common.bus.zenoh_bus import ZenohBus  # the other commands on keys need no bus
 
-    bus = ZenohBus(listen, connect, access_of(os.environ, MASTER), router=True)
-    try:
-        _notify("router", f"listening on {listen}" + "".join(f", joined with {one}" for one in connect))
+    with closing(ZenohBus(listen, connect, access_of(os.environ, MASTER), router=True)) as bus:
+        echo(f"router: listening on {listen}" + "".join(f", joined with {one}" for one in connect))
         joined = 0
         while not stop.wait(0.5):
             if bus.peers != joined:
                 joined = bus.peers
-                _notify("router", f"joined with {joined} of other routers")
-    finally:
-        bus.close()
-
-
-def _repeat(below: "ZenohBus", above: "ZenohBus", site: str, stop: threading.Event) -> None:
-    try:
-        repeats = Relay(below, above, SystemClock())
-        _notify("relay", f"repeating as {site}")
-        try:
-            repeats.report(lambda line: _notify("relay", line), stop)
-        finally:
-            repeats.close()
-    finally:
-        above.close()
-
-
-def _notify(who: str, line: str) -> None:
-    echo(f"{who}: {line}")
+                echo(f"router: joined with {joined} of other routers")

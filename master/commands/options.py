@@ -150,6 +150,13 @@ def add_picture(command: ArgumentParser, what: str) -> None:
     add_path(command, "--picture", "FILE", f"draw {what} in this .png")
 
 
+def add_results(command: ArgumentParser, drawn: str) -> None:
+    """Options of a calibration: files, numbers, and a picture of what is `drawn`."""
+    add_out(command)
+    add_json(command)
+    add_picture(command, drawn)
+
+
 def add_joints(command: ArgumentParser) -> None:
     """Names of joints in a motion capture."""
     text = 'JSON of names in a motion capture: {"index-finger-tip": "NAME", ...}, null: not there'

@@ -300,10 +300,10 @@ def run(options: Namespace) -> None:
     settings = LiveSettings(
         *checked_ends(options),
         options.bus,
+        files,
         options.start_timeout_s,
         options.poses,
         options.summary,
-        files,
         options.record,
     )
     run_live(setups, link_key(os.environ, options.key_file), settings, stop_on_signals(), print_line)

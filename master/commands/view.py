@@ -2,6 +2,7 @@
 
 import os
 from argparse import Namespace
+from contextlib import closing
 
 from common.bus.keys import ENVIRONMENT, keys_folder, rig_key
 from master.commands.options import address, rigs_of
@@ -21,7 +22,7 @@ def view(options: Namespace) -> None:
     )
     if connection is None:
         return
-    try:
+    with closing(connection):
         mode = "save" if options.save is not None else "web" if options.web else "spawn"
         run_viewer(
             connection,
@@ -32,8 +33,6 @@ def view(options: Namespace) -> None:
             web_port=options.web_port,
             on_ready=print_line,
         )
-    finally:
-        connection.close()
 
 
 def console(options: Namespace) -> None:

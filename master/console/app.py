@@ -11,13 +11,14 @@ import threading
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-import uvicorn
 from fastapi import FastAPI
 from nicegui import ui
 
 from common.errors import PhalanxError
+from common.messages.streams import MASTER
 from master.console.controls import every
 from master.console.login import LOGOUT, LoginRequired, PasswordHash, kept_password, password_from
 from master.console.pages import checklist, gestures, live, outputs, plots, tune
@@ -30,8 +31,11 @@ from master.outputs.web.listening import is_loopback, page_certificate, places_o
 TITLE = "Phalanx"
 _PRIMARY = "#1b6ac9"  # white on it, and itself on a dark panel, can be read
 _STYLE = Path(__file__).parent / "static" / "console.css"
-_THEMES: dict[str, bool | None] = {"auto": None, "light": False, "dark": True}
-_THEME_ICONS = {"auto": "brightness_auto", "light": "light_mode", "dark": "dark_mode"}
+_THEMES: dict[str, tuple[bool | None, str]] = {  # dark?, icon
+    "auto": (None, "brightness_auto"),
+    "light": (False, "light_mode"),
+    "dark": (True, "dark_mode"),
+}
 # A page that is cut off because its session is over goes to the login instead of trying for ever.
 _SESSION_OVER = """<script>setInterval(async () => {
   if (!window.socket || window.socket.connected) return;
@@ -59,7 +63,12 @@ def shell(state: ConsoleState, pages: Sequence[Page], here: str, logout: bool = 
         ui.label("Phalanx").classes("console-name gt-sm")
         with ui.element("nav").classes("console-nav").props('aria-label="Pages"'):
             for page in pages:
-                _entry(page, page.route == here)
+                link = ui.link(target=page.route).classes("console-entry").props(f'aria-label="{page.title}"')
+                if page.route == here:
+                    link.classes("here").props('aria-current="page"')
+                with link:
+                    ui.icon(page.icon).props("aria-hidden=true")
+                    ui.label(page.title).classes("console-entry-title")
         ui.space()
         _connection(state)
         _badge(state)
@@ -74,14 +83,6 @@ def shell(state: ConsoleState, pages: Sequence[Page], here: str, logout: bool = 
     ui.skip_link("Skip to the page", target=main)
 
 
-def _entry(page: Page, here: bool) -> None:
-    link = ui.link(target=page.route).classes("console-entry" + (" here" if here else ""))
-    link.props(f'aria-label="{page.title}"' + (' aria-current="page"' if here else ""))
-    with link:
-        ui.icon(page.icon).props("aria-hidden=true")
-        ui.label(page.title).classes("console-entry-title")
-
-
 def _connection(state: ConsoleState) -> None:
     with ui.element("div").classes("console-status").props('role="status"'):
         dot = ui.element("span").classes("console-dot")
@@ -89,30 +90,33 @@ def _connection(state: ConsoleState) -> None:
         hint = ui.tooltip("")
 
     def update() -> None:
-        up = "master" in state.alive
-        dot.classes(replace="console-dot " + ("good" if up else "warn" if state.link.up else "bad"))
-        text.set_text("connected" if up else "no master" if state.link.up else "not connected")
-        names = ", ".join(sorted(state.alive - {"master"})) or "no slaves"
-        hint.set_text(names if state.link.up else state.link.reason)
+        if not state.link.up:
+            kind, words, more = "bad", "not connected", state.link.reason
+        else:
+            kind, words = ("good", "connected") if MASTER in state.alive else ("warn", "no master")
+            more = ", ".join(sorted(state.alive - {MASTER})) or "no slaves"
+        dot.classes(replace=f"console-dot {kind}")
+        text.set_text(words)
+        hint.set_text(more)
 
     every(1.0, update)
 
 
 def _badge(state: ConsoleState) -> None:
-    link = ui.link(target="/checklist").classes("console-badge")
-    with link:
+    with ui.link(target="/checklist").classes("console-badge") as link:
         icon = ui.icon("check_circle").props("aria-hidden=true")
         text = ui.label()
 
     def update() -> None:
-        checklist = state.checklist
-        items = None if checklist is None else len(checklist.items)
-        kind = "unknown" if items is None else "good" if items == 0 else "bad"
-        link.classes(replace=f"console-badge {kind}")
-        icon.set_name({"unknown": "help", "good": "check_circle", "bad": "error"}[kind])
-        words = "no checklist" if items is None else "all well" if items == 0 else f"{items} to do"
+        if state.checklist is None:
+            kind, name, words = "unknown", "help", "no checklist"
+        elif items := state.checklist.items:
+            kind, name, words = "bad", "error", f"{len(items)} to do"
+        else:
+            kind, name, words = "good", "check_circle", "all well"
+        link.classes(replace=f"console-badge {kind}").props(f'aria-label="Checklist: {words}"')
+        icon.set_name(name)
         text.set_text(words)
-        link.props(f'aria-label="Checklist: {words}"')
 
     every(1.0, update)
 
@@ -128,28 +132,28 @@ def _logout() -> None:
 
 
 def _theme() -> None:
-    request = ui.context.client.request
-    now = request.cookies.get("theme", "auto")
-    now = now if now in _THEMES else "auto"
-    dark = ui.dark_mode(_THEMES[now])
     names = list(_THEMES)
-
-    def next_theme() -> None:
-        nonlocal now
-        now = names[(names.index(now) + 1) % len(names)]
-        dark.set_value(_THEMES[now])
-        ui.run_javascript(f'document.cookie = "theme={now}; path=/; max-age=31536000; samesite=strict"')
-        show()
-
-    button = ui.button(on_click=next_theme).props("flat round dense color=inherit").classes("console-theme")
+    now = ui.context.client.request.cookies.get("theme", "auto")
+    now = now if now in _THEMES else "auto"
+    dark = ui.dark_mode()
+    button = ui.button().props("flat round dense color=inherit").classes("console-theme")
     with button:
         hint = ui.tooltip("")
 
     def show() -> None:
-        button.set_icon(_THEME_ICONS[now])
+        value, icon = _THEMES[now]
+        dark.set_value(value)
+        button.set_icon(icon)
         button.props(f'aria-label="Theme: {now}. Change"')
         hint.set_text(f"theme: {now}")
 
+    def next_theme() -> None:
+        nonlocal now
+        now = names[(names.index(now) + 1) % len(names)]
+        ui.run_javascript(f'document.cookie = "theme={now}; path=/; max-age=31536000; samesite=strict"')
+        show()
+
+    button.on_click(next_theme)
     show()
 
 
@@ -164,27 +168,21 @@ PAGES: tuple[Page, ...] = (
 )
 
 
-def start_page(state: ConsoleState) -> str:
-    """Return the page on which the console opens: set-up while no rig can be used."""
-    return PAGES[0].route if state.rigs() else "/setup"
-
-
 def register(state: ConsoleState, logout: bool = False) -> None:
     """Register every page with NiceGUI, once in a process; `logout`: with its button."""
 
-    def add(page: Page) -> None:
-        def show() -> None:
-            with shell(state, PAGES, page.route, logout=logout):
-                page.build(state)
-
-        ui.page(page.route, title=f"{page.title} · {TITLE}", response_timeout=20.0)(show)
+    def show(page: Page) -> None:
+        with shell(state, PAGES, page.route, logout=logout):
+            page.build(state)
 
     for page in PAGES:
-        add(page)
+        title = f"{page.title} · {TITLE}"
+        ui.page(page.route, title=title, response_timeout=20.0)(partial(show, page))
 
     @ui.page("/", title=TITLE)
     def start() -> None:
-        ui.navigate.to(start_page(state))
+        """The console opens on the set-up while no rig can be used."""
+        ui.navigate.to(PAGES[0].route if state.rigs() else "/setup")
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,11 +202,11 @@ def login_of(settings: ConsoleSettings, folder: Path, notify: Callable[[str], No
     Raises:
         PhalanxError: A file of the password or of the certificate cannot be used.
     """
-    here = is_loopback(settings.host)
+    here, password = is_loopback(settings.host), None
     if settings.password_file is not None:
         password = password_from(settings.password_file)
-    else:
-        password = None if here else kept_password(folder, notify)
+    elif not here:
+        password = kept_password(folder, notify)
     if here:
         return LoginPage(password)
     if settings.open_links:
@@ -237,7 +235,12 @@ def run_console(settings: ConsoleSettings, stop: threading.Event, notify: Callab
     try:
         register(state, logout=login.password is not None)
         server = console_server(console_app(state, settings.host, port, login), login.tls)
-        threading.Thread(target=_end_with, args=(stop, server), name="console stop", daemon=True).start()
+
+        def end() -> None:
+            stop.wait()
+            server.should_exit = True
+
+        threading.Thread(target=end, name="console stop", daemon=True).start()
         scheme = "http" if login.tls is None else "https"
         notify("console: " + " ".join(f"{scheme}://{place}:{port}/" for place in places_of(host)))
         server.run(sockets=[listening])
@@ -272,11 +275,6 @@ def console_app(state: ConsoleState, host: str, port: int, login: LoginPage) -> 
     neighbours = same_user if login.password is None else None
     app.add_middleware(OwnPagesOnly, allowed=names_of(host), same_user=neighbours)  # the outermost
     return app
-
-
-def _end_with(stop: threading.Event, server: uvicorn.Server) -> None:
-    stop.wait()
-    server.should_exit = True
 
 
 def _listen(host: str, port: int) -> socket.socket:

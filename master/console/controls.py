@@ -1,10 +1,10 @@
 """Controls change settings of the running rig, and tune them.
 
-Sliders, camera views and labels that the pages share; `CommandQueue` sends a page's changes one at a time,
-newest only. `Tuner` tries settings of a camera over the bus; functions beside it try and save a rig's filter.
-These block: never call them on the thread of the page. The master and the wizards read this machine's copy of
-a camera's file: after a slave of another machine saved its own, settings and colour ranges are copied, not
-the calibration (`update_copy`).
+Camera views, panels, errors and texts that the pages share; `CommandQueue` sends a page's changes one at a
+time, newest only. `Tuner` tries settings of a camera over the bus, `FilterTuner` the filter of a rig. These
+block: never call them on the thread of the page. The master and the wizards read this machine's copy of a
+camera's file: after a slave of another machine saved its own, settings and colour ranges are copied, not the
+calibration (`update_copy`).
 """
 
 import asyncio
@@ -13,7 +13,6 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from math import nan
 from pathlib import Path
 from typing import Generic, TypeVar, cast
 
@@ -22,110 +21,76 @@ from nicegui import background_tasks, ui
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
-from common.calibration import CameraCalibration, FilterCalibration, RigCalibration, load, save
+from common.calibration import CameraCalibration, HsvRange, RigCalibration, load, save
 from common.calibration.camera_settings import WANTED, CameraSettings, ColourPick
 from common.errors import BusError, CalibrationError, PhalanxError
-from common.hand.model import JOINTS
+from common.hand.model import FINGERS, JOINTS
 from common.messages import Command, Contact, Gesture, HandPose, Health, ObjectPose, ObjectSource, Source
 from common.messages.streams import MASTER
 from master.calibrate.tree_files import provenance
+from master.console.setup.files import keep_old
+
+AnswerT = TypeVar("AnswerT")
 
 
-def every(period_s: float, update: Callable[[], None]) -> None:
+def every(period_s: float, update: Callable[[], object]) -> None:
     """Update a part of the page now, and again and again while the page is open."""
     update()
     ui.timer(period_s, update)
 
 
-class Setting:
-    """Slider (logarithmic where a value spans decades) and number field of one value.
-
-    A change by a person is passed once to `on_change`; `show` changes the controls and calls nothing.
-    """
-
-    def __init__(
-        self,
-        title: str,
-        unit: str,
-        low: float,
-        high: float,
-        on_change: Callable[[float], object],
-        *,
-        digits: int = 2,
-        log: bool = False,
-    ) -> None:
-        """Build one row of the form.
-
-        The slider spans `low` to `high`; a number beyond may be typed, and `on_change`, which gets each new
-        value, may refuse.
-        """
-        self._low, self._high, self._log, self._digits = low, high, log, digits
-        self._on_change = on_change
-        self._value: float | None = None
-        label = f"{title} ({unit})" if unit else title
-        with ui.element("div").classes("setting") as self._row:
-            ui.label(title).classes("setting-title")
-            step = 0.001 if log else 10.0**-digits
-            ends = (0.0, 1.0) if log else (low, high)
-            self._slider = ui.slider(min=ends[0], max=ends[1], step=step, value=ends[0])
-            self._slider.props(f'aria-label="{label}"').classes("setting-slider")
-            self._number = ui.number(value=None, format=f"%.{digits}f", suffix=unit or None)
-            self._number.props(f'dense outlined aria-label="{label}, number"').classes("setting-number")
-            self._back = ui.label("").classes("setting-back").props('role="status"')
-        self._slider.on_value_change(lambda event: self._moved(event.value))
-        # Typed digit by digit: only what is finished is meant.
-        self._number.on("keydown.enter", lambda: self._typed())
-        self._number.on("blur", lambda: self._typed())
-
-    @property
-    def value(self) -> float | None:
-        """The value shown; None: none was shown yet."""
-        return self._value
-
-    def show(self, value: float, read: float | None = None) -> None:
-        """Show what is wanted, and what was read back; None: it was not."""
-        self._value = value
-        self._slider.set_value(self._place(value))
-        self._number.set_value(round(value, self._digits))
-        same = read is None or math.isclose(read, value, rel_tol=0.01, abs_tol=0.6 * 10.0**-self._digits)
-        self._back.set_text("" if read is None or same else f"is {read:.{self._digits}f}")
-
-    def set_visible(self, on: bool) -> None:
-        """Offer it, or not: a camera that does not know a setting has none to change."""
-        self._row.set_visibility(on)
-
-    def _moved(self, place: float | None) -> None:
-        if place is None or self._value is None or place == self._place(self._value):
-            return  # `show` moved it
-        self._change(self._at(place), number=True)
-
-    def _typed(self) -> None:
-        value = self._number.value
-        if value is None or (
-            self._value is not None and math.isclose(value, self._value, abs_tol=0.5 * 10.0**-self._digits)
-        ):
-            return
-        self._change(float(value), number=False)
-
-    def _change(self, value: float, *, number: bool) -> None:
-        self._value = value
-        if number:
-            self._number.set_value(value)
-        else:
-            self._slider.set_value(self._place(value))
-        self._on_change(value)
-
-    def _place(self, value: float) -> float:
-        inside = min(max(value, self._low), self._high)
-        if not self._log:
-            return round(inside, self._digits)
-        return round(math.log(inside / self._low) / math.log(self._high / self._low), 3)
-
-    def _at(self, place: float) -> float:
-        return round(self._low * (self._high / self._low) ** place if self._log else place, self._digits)
+def html(period_s: float, classes: str, text: Callable[[], str]) -> None:
+    """A part of the page whose HTML is `text()`, now and again and again."""
+    content = ui.html("", sanitize=False).classes(classes)
+    every(period_s, lambda: content.set_content(text()))
 
 
-AnswerT = TypeVar("AnswerT")
+def panel(title: str, classes: str = "") -> Element:
+    """A titled section of a page, to be filled by `with`."""
+    with ui.element("section").classes(f"panel {classes}").props(f'aria-label="{title}"') as section:
+        ui.label(title).classes("panel-title")
+    return section
+
+
+def offer(select: ui.select, names: list[str]) -> None:
+    """Let one of these names be chosen; what was chosen stays if it is one of them."""
+    if select.options != names:
+        select.set_options(names, value=select.value if select.value in names else None)
+
+
+def no_camera(title: str) -> None:
+    """What stands in place of a page's cameras while there is none."""
+    with ui.element("div").classes("panel empty"):
+        ui.label(title)
+        ui.label("The Set-up page starts one.").classes("soft")
+
+
+class Problem(ui.label):
+    """The error of the last action of a panel; empty while there is none."""
+
+    def __init__(self) -> None:
+        super().__init__("")
+        self.classes("problem").props('role="alert"')
+        self._page = ui.context.client
+
+    def show(self, text: str) -> None:
+        """Show an error, here and over the page."""
+        self.set_text(text)
+        with self._page:
+            ui.notify(text, type="negative", multi_line=True, close_button="OK")
+
+    async def attempt(
+        self, action: Callable[[], AnswerT], then: Callable[[AnswerT], object] = lambda _: None
+    ) -> bool:
+        """Run a slow action off the event loop, `then` show its answer; False: it failed."""
+        self.set_text("")
+        try:
+            answer = await asyncio.to_thread(action)
+        except PhalanxError as error:
+            self.show(str(error))
+            return False
+        then(answer)
+        return True
 
 
 class CommandQueue(Generic[AnswerT]):
@@ -143,7 +108,7 @@ class CommandQueue(Generic[AnswerT]):
         page's loop, unless more is to be sent already; `on_error` with the error's text.
         """
         self._send, self._on_answer, self._on_error = send, on_answer, on_error
-        self._waiting: dict[tuple[str, str | None], object] = {}
+        self._waiting: dict[str, object] = {}
         self._task: asyncio.Task[None] | None = None
 
     @property
@@ -151,9 +116,12 @@ class CommandQueue(Generic[AnswerT]):
         """Whether something is on its way."""
         return self._task is not None and not self._task.done()
 
-    def change(self, key: str, value: object, part: str | None = None) -> None:
-        """Send `key: value` soon, the newest; with `part` one entry of the map `key`."""
-        self._waiting[key, part] = value
+    def change(self, key: str, value: object) -> None:
+        """Send `key: value` soon, the newest; entries of a map are merged."""
+        before = self._waiting.get(key)
+        if isinstance(value, dict) and isinstance(before, dict):
+            value = cast(dict[str, object], before) | cast(dict[str, object], value)
+        self._waiting[key] = value
         if not self.busy:
             self._task = background_tasks.create(self._work(), name="commands")
 
@@ -163,21 +131,12 @@ class CommandQueue(Generic[AnswerT]):
             await asyncio.sleep(quiet_s)
             waiting, self._waiting = self._waiting, {}
             try:
-                answer = await asyncio.to_thread(self._send, _merged(waiting))
+                answer = await asyncio.to_thread(self._send, waiting)
             except PhalanxError as error:
                 self._on_error(str(error))
             else:
                 if not self._waiting:
                     self._on_answer(answer)
-
-
-def _merged(waiting: Mapping[tuple[str, str | None], object]) -> dict[str, object]:
-    out: dict[str, object] = {key: value for (key, part), value in waiting.items() if part is None}
-    for key in {key for key, part in waiting if part is not None}:
-        out[key] = {
-            part: value for (other, part), value in waiting.items() if other == key and part is not None
-        }
-    return out
 
 
 class CameraView(Element, component="static/camera_view.js"):
@@ -191,13 +150,11 @@ class CameraView(Element, component="static/camera_view.js"):
         `on_pick` gets the place in the picture, as shares (0..1) of its width and height, and its time [ns].
         """
         super().__init__()
-        self._props["camera"] = camera
-        self._props["label"] = label
-        self._props["mask"] = []
-        self._props["picks"] = on_pick is not None
-        self.on("pick", lambda event: None if on_pick is None else on_pick(*_place(event)))
+        self._props.update(camera=camera, label=label, mask=[], picks=on_pick is not None)
+        if on_pick is not None:
+            self.on("pick", lambda event: on_pick(*_place(event)))
 
-    def tint(self, markers: tuple[str, ...]) -> None:
+    def tint(self, markers: Iterable[str]) -> None:
         """Tint the pixels in the ranges of these markers."""
         self._props["mask"] = list(markers)
 
@@ -235,7 +192,6 @@ _OBJECT_SOURCES = {
     ObjectSource.TRACKER: "by its tracker",
     ObjectSource.HELD: "held where it was last seen",
 }
-FINGERS = ("thumb", "index", "middle", "ring", "little")
 
 
 def joint_states(pose: HandPose) -> list[tuple[str, str, bool]]:
@@ -250,18 +206,17 @@ def hand_line(pose: HandPose) -> str:
     """How much of a hand is known, in one line."""
     states = joint_states(pose)
     count = Counter(state for _, state, _ in states)
-    tracked = sum(1 for *_, now in states if now)
+    tracked = sum(now for *_, now in states)
     parts = [f"{count[word]} {word}" for word in SOURCES.values() if count[word]]
     return f"{tracked} of {len(states)} joints seen now: {', '.join(parts)}"
 
 
 def object_line(pose: ObjectPose, contacts: Sequence[Contact]) -> str:
     """Where an object is, and what holds or touches it."""
-    source = _OBJECT_SOURCES[ObjectSource(pose.source)]
     if any(math.isnan(x) for x in pose.position_m):
         return f"not seen; {pose.seen} of {pose.expected} features"
     x, y, z = (1e3 * float(v) for v in pose.position_m)
-    parts = [f"at {x:.0f}, {y:.0f}, {z:.0f} mm", source]
+    parts = [f"at {x:.0f}, {y:.0f}, {z:.0f} mm", _OBJECT_SOURCES[ObjectSource(pose.source)]]
     if pose.occluded:
         parts.append("partly hidden")
     for contact in contacts:
@@ -294,23 +249,9 @@ def readable(name: str) -> str:
     return name.replace("_", " ")
 
 
-def gesture_lines(gestures: Mapping[tuple[str, str], Gesture], hand: str) -> list[str]:
-    """Return text lines for the current gestures of one hand."""
-    return [gesture_line(one) for (whose, _), one in sorted(gestures.items()) if whose == hand]
-
-
 MARKER = "marker."
-_CHANNELS = ("h", "s", "v")
 PLAIN = ("exposure_us", "analogue_gain", "frame_rate_hz", "roi_margin")
 GAINS = ("red_gain", "blue_gain")
-
-
-@dataclass(frozen=True, slots=True)
-class Range:
-    """Marker colours in OpenCV's HSV (H 0-179); low[0] > high[0] wraps through red."""
-
-    low: tuple[int, int, int]
-    high: tuple[int, int, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,51 +259,44 @@ class InUse:
     """Settings and colours in use, as a slave's answer reports them.
 
     Attributes:
-        wanted: Setting -> what its camera file in use states, by the names of metrics.
+        wanted: Setting -> what the file in use states, by the names of metrics.
         read: Setting -> what was read back from the camera; absent where it does not report it.
         markers: Marker -> its colours in use; absent: it has none.
     """
 
     wanted: Mapping[str, float] = field(default_factory=dict[str, float])
     read: Mapping[str, float] = field(default_factory=dict[str, float])
-    markers: Mapping[str, Range] = field(default_factory=dict[str, Range])
+    markers: Mapping[str, HsvRange] = field(default_factory=dict[str, HsvRange])
 
     @classmethod
     def of(cls, health: Health) -> "InUse":
         """Read an answer."""
-        names = (*PLAIN, *GAINS)
         metrics = health.metrics
-        read = {name: metrics[name] for name in names if name in metrics}
-        wanted = {name: metrics.get(WANTED + name, metrics.get(name, nan)) for name in names}
-        markers: dict[str, Range] = {}
-        for metric in metrics:
-            name = metric.removeprefix(MARKER).removesuffix(".h_low")
-            if metric == f"{MARKER}{name}.h_low":
-                markers[name] = _range(metrics, name)
-        known = {name: value for name, value in wanted.items() if value == value}
-        return cls(known, read, markers)
+        read = {name: metrics[name] for name in (*PLAIN, *GAINS) if name in metrics}
+        wanted = read | {
+            name: metrics[WANTED + name] for name in (*PLAIN, *GAINS) if WANTED + name in metrics
+        }
+        first = ".h_low"
+        names = [
+            metric[len(MARKER) : -len(first)]
+            for metric in metrics
+            if metric.startswith(MARKER) and metric.endswith(first)
+        ]
+        return cls(wanted, read, {name: _range(metrics, name) for name in names})
 
-    def body(self) -> dict[str, object]:
-        """The body of the command "set" that brings all this back."""
+    def body(self, known: Iterable[str]) -> dict[str, object]:
+        """Body of the command "set" that brings all this back, and no other of `known`."""
         out: dict[str, object] = {name: self.wanted[name] for name in PLAIN if name in self.wanted}
         if all(name in self.wanted for name in GAINS):
             out["colour_gains"] = [self.wanted[name] for name in GAINS]
-        if self.markers:
-            out["markers"] = markers_over(self, ())
-        return out
+        markers: dict[str, object] = {name: None for name in sorted(set(known) - self.markers.keys())}  # noqa: C420
+        markers |= {name: colour_body(colour) for name, colour in self.markers.items()}
+        return out | {"markers": markers}
 
 
-def markers_over(used: InUse, known: Iterable[str]) -> dict[str, object]:
-    """Return `markers` of the command "set": those of `used`, no other of `known`."""
-    out: dict[str, object] = {}
-    out.update(dict.fromkeys(sorted(set(known) - used.markers.keys())))
-    out.update({name: colour_body(colour) for name, colour in used.markers.items()})
-    return out
-
-
-def colour_body(colour: Range) -> dict[str, list[int]]:
+def colour_body(colour: HsvRange) -> dict[str, list[int]]:
     """A colour as the command "set" has it."""
-    return {"hsv_low": list(colour.low), "hsv_high": list(colour.high)}
+    return {"hsv_low": list(colour.hsv_low), "hsv_high": list(colour.hsv_high)}
 
 
 class Tuner:
@@ -371,15 +305,12 @@ class Tuner:
     Each method asks the slave, waits, and raises a BusError if it does not answer or refuses.
     """
 
-    def __init__(self, camera: str, ask: Callable[[Command], Health]) -> None:
+    def __init__(self, camera: str, ask: Callable[[Command], Health], copy: Path | None = None) -> None:
+        """Tune `camera`; `copy`: its file on this machine, which follows what is saved."""
         self.camera = camera
-        self._ask = ask
+        self.now = InUse()  # by the newest answer
+        self._ask, self._copy = ask, copy
         self._begun: InUse | None = None
-
-    @property
-    def begun(self) -> InUse | None:
-        """What `revert` goes back to; None: the slave has never answered."""
-        return self._begun
 
     def refresh(self) -> InUse:
         """What is in use now."""
@@ -404,31 +335,37 @@ class Tuner:
         return self.set({"markers": {marker: None}})
 
     def save(self) -> InUse:
-        """Write what is in use to the slave's own camera file."""
+        """Write what is in use to the slave's own camera file, then to the copy.
+
+        Raises:
+            CalibrationError: As of `update_copy`.
+        """
         self._begun = self._send("save", "")
+        if self._copy is not None and self._copy.exists():
+            update_copy(self._copy, self._begun)
         return self._begun
 
     def revert(self) -> InUse:
         """Use again what was in use when the tuning began, or was saved last."""
         if self._begun is None:
             raise BusError(f"{self.camera!r} has not answered yet: there is nothing to go back to")
-        markers = markers_over(self._begun, self.refresh().markers)
-        return self._send("set", json.dumps(self._begun.body() | {"markers": markers}))
+        return self._send("set", json.dumps(self._begun.body(self.refresh().markers)))
 
     def _begin(self) -> None:
         if self._begun is None:
             self.refresh()
 
     def _send(self, verb: str, body: str) -> InUse:
-        return InUse.of(self._ask(Command(self.camera, verb, body)))
+        self.now = InUse.of(self._ask(Command(self.camera, verb, body)))
+        return self.now
 
 
-def _range(metrics: Mapping[str, float], name: str) -> Range:
+def _range(metrics: Mapping[str, float], name: str) -> HsvRange:
     low, high = (
-        tuple(round(metrics.get(f"{MARKER}{name}.{channel}_{end}", 0.0)) for channel in _CHANNELS)
+        tuple(round(metrics.get(f"{MARKER}{name}.{channel}_{end}", 0.0)) for channel in "hsv")
         for end in ("low", "high")
     )
-    return Range((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+    return HsvRange(hsv_low=(low[0], low[1], low[2]), hsv_high=(high[0], high[1], high[2]))
 
 
 def update_copy(path: Path, saved: InUse) -> bool:
@@ -439,43 +376,50 @@ def update_copy(path: Path, saved: InUse) -> bool:
             contain.
     """
     camera = load(path, CameraCalibration)
-    body = saved.body() | {"markers": markers_over(saved, camera.markers or {})}
     try:
-        new = msgspec.convert(body, CameraSettings).over(camera)
+        new = msgspec.convert(saved.body(camera.markers or {}), CameraSettings).over(camera)
     except msgspec.ValidationError as error:
         raise CalibrationError(f"{path}: what {camera.name} saved cannot be copied: {error}") from error
     if new == camera:
         return False
+    keep_old(path.parents[1], path)
     made = provenance("console", (), {}, "as the slave saved it")
     save(path, msgspec.structs.replace(new, provenance=camera.provenance | {"markers": made}))
     return True
 
 
-def saved_filter(rig_path: Path) -> FilterCalibration:
-    """Return the filter settings stored in the rig's file.
+class FilterTuner:
+    """Tuner of a rig's filter: the master tries it at once, the rig's file keeps it.
 
-    Raises:
-        CalibrationError: It is missing or broken.
+    Each method raises a BusError where no master answers or it refuses, a CalibrationError where the file is
+    missing, broken or read-only, or a value is out of range.
     """
-    return load(rig_path, RigCalibration).filter
 
+    def __init__(self, rig: str, path: Path, ask: Callable[[Command], Health]) -> None:
+        """Tune the filter of `rig`, whose file is `path`."""
+        self.now = InUse()  # what is tried; also while no master runs: it can be saved
+        self._rig, self._path, self._ask = rig, path, ask
 
-def try_filter(ask: Callable[[Command], Health], rig: str, values: Mapping[str, float]) -> None:
-    """Let the master use other parameters at once; its file stays as it is.
+    def refresh(self) -> InUse:
+        """What the rig's file states."""
+        filter_ = load(self._path, RigCalibration).filter
+        self.now = InUse({name: float(value) for name, value in msgspec.structs.asdict(filter_).items()})
+        return self.now
 
-    Raises:
-        BusError: No master answers, or it refuses.
-    """
-    ask(Command(MASTER, "filter", json.dumps({"rig": rig, "filter": dict(values)})))
+    def set(self, change: Mapping[str, object]) -> InUse:
+        """Let the master use other parameters at once; its file stays as it is."""
+        self.now = InUse({**self.now.wanted, **cast(Mapping[str, float], change)})
+        self._ask(Command(MASTER, "filter", json.dumps({"rig": self._rig, "filter": self.now.wanted})))
+        return self.now
 
+    def save(self) -> InUse:
+        """Write what is tried to the rig's file, which a running master follows."""
+        rig = load(self._path, RigCalibration)
+        new = msgspec.structs.replace(rig.filter, **self.now.wanted)
+        made = rig.provenance | {"filter": provenance("console", (), {}, "tuned by hand")}
+        save(self._path, msgspec.structs.replace(rig, filter=new, provenance=made))
+        return self.refresh()
 
-def save_filter(rig_path: Path, values: Mapping[str, float]) -> None:
-    """Write the filter settings to the rig's file, which a running master follows.
-
-    Raises:
-        CalibrationError: The file is missing, broken or read-only, or a value is out of range.
-    """
-    rig = load(rig_path, RigCalibration)
-    new = msgspec.structs.replace(rig.filter, **values)
-    made = provenance("console", (), {}, "tuned by hand")
-    save(rig_path, msgspec.structs.replace(rig, filter=new, provenance=rig.provenance | {"filter": made}))
+    def revert(self) -> InUse:
+        """Try again what the file states."""
+        return self.set(self.refresh().wanted)

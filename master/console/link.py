@@ -6,13 +6,13 @@ claims to be larger than the camera's own picture is not shown.
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 
 from common.bus.bus import Bus, Subscription
 from common.calibration import CameraCalibration
 from common.errors import BusError, CalibrationError
 from common.messages import Command, Health, Message, Preview
-from common.messages.command_bodies import PreviewWish
+from common.messages.command_bodies import PreviewRequest
 from common.messages.picture_size import Size, jpeg_size
 
 POLL_S = 0.5  # between two looks at who is alive
@@ -24,13 +24,13 @@ Take = Callable[[Message], None]
 class Link:
     """Bus connection, and which processes are alive; one thread updates both."""
 
-    def __init__(self, open_bus: Callable[[], Bus], take: Mapping[str, Take]) -> None:
+    def __init__(self, open_bus: Callable[[], Bus], streams: Sequence[str], take: Take) -> None:
         """Begin to connect.
 
-        `open_bus` raises `BusError` while nobody listens there. `take`: stream -> what is called with each of
-        its messages, on a thread of its own; must not raise.
+        `open_bus` raises `BusError` while nobody listens there. `take` gets each message of `streams`, of
+        each on a thread of its own; must not raise.
         """
-        self._open_bus, self._take = open_bus, dict(take)
+        self._open_bus, self._streams, self._take = open_bus, streams, take
         self._bus: Bus | None = None
         self._alive: frozenset[str] = frozenset()
         self._reason = "not connected yet"
@@ -87,13 +87,12 @@ class Link:
         """Read and look around until the others are gone or the console ends."""
         ended = threading.Event()
         depth = 64
-        inboxes = {stream: bus.subscribe(stream, depth=depth) for stream in self._take}
+        inboxes = [bus.subscribe(stream, depth=depth) for stream in self._streams]
         readers = [
-            threading.Thread(target=_read, args=(inbox, self._take[stream], ended), name=f"read {stream}")
-            for stream, inbox in inboxes.items()
+            threading.Thread(target=self._read, args=(inbox, ended), name=f"read {stream}", daemon=True)
+            for stream, inbox in zip(self._streams, inboxes, strict=True)
         ]
         for reader in readers:
-            reader.daemon = True
             reader.start()
         self._bus = bus
         empty = 0
@@ -108,17 +107,16 @@ class Link:
             self._reason = str(error)
         finally:
             ended.set()
-            for inbox in inboxes.values():
+            for inbox in inboxes:
                 inbox.close()
             for reader in readers:
                 reader.join(2.0)
 
-
-def _read(inbox: Subscription, take: Take, ended: threading.Event) -> None:
-    while not ended.is_set():
-        message = inbox.get(0.2)
-        if message is not None:
-            take(message)
+    def _read(self, inbox: Subscription, ended: threading.Event) -> None:
+        while not ended.is_set():
+            message = inbox.get(0.2)
+            if message is not None:
+                self._take(message)
 
 
 class PreviewLeases:
@@ -154,7 +152,7 @@ class PreviewLeases:
 
     def _work(self, camera: str) -> None:
         while (mask := self._mask(camera)) is not None:
-            body = PreviewWish(mask=mask, found=True).body() if mask else ""
+            body = PreviewRequest(mask=mask, found=True).body() if mask else ""
             try:
                 self._ask(Command(camera, "preview", body), 1.5)
                 self._errors.pop(camera, None)

@@ -12,14 +12,14 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from typing import IO, TypeVar
+from typing import IO
 
 from common.errors import PhalanxError
 from master.console.process_supervisor import ENDS_S
 
-T = TypeVar("T")
 _KILLED_S = 2.0
 _CHUNK = 8192
 
@@ -36,7 +36,7 @@ class LocalProcess:
         self.name, self.command = name, tuple(command)
         self.lines: deque[str] = deque(maxlen=200)
         self.prompt = ""
-        self._stopped = False
+        self.stopped = False  # by `stop` or `interrupt`: then an exit code is no failure
         try:
             self._child = subprocess.Popen(
                 self.command,
@@ -48,7 +48,9 @@ class LocalProcess:
             )
         except OSError as error:
             raise PhalanxError(f"{name}: cannot start {self.command[0]}: {error.strerror}") from error
+        assert self._child.stdin is not None
         assert self._child.stdout is not None
+        self._keyboard = self._child.stdin
         self._reader = threading.Thread(target=self._read, args=(self._child.stdout,), daemon=True)
         self._reader.start()
 
@@ -61,33 +63,24 @@ class LocalProcess:
         """Its exit code; None while it runs. Negative: the signal that ended it."""
         return self._child.poll()
 
-    @property
-    def stopped(self) -> bool:
-        """Whether `stop` was called: then an exit code is no failure."""
-        return self._stopped
-
     def tail(self, count: int = 12) -> list[str]:
         """Its last lines."""
         return list(self.lines)[-count:]
 
     def send(self, line: str = "") -> None:
         """A line for its keyboard, as Enter; nothing happens once it has ended."""
-        if self._child.stdin is None:
-            return
-        try:
-            self._child.stdin.write(f"{line}\n".encode())
-            self._child.stdin.flush()
-        except (OSError, ValueError):
-            return  # it ended meanwhile, which `ended` reports
+        with suppress(OSError, ValueError):  # it ended meanwhile, which `ended` reports
+            self._keyboard.write(f"{line}\n".encode())
+            self._keyboard.flush()
 
     def interrupt(self) -> None:
         """Ask it to end (SIGINT), as Ctrl-C does; does not wait."""
-        self._stopped = True
+        self.stopped = True
         self._signal(signal.SIGINT)
 
     def stop(self, ends_s: float = ENDS_S) -> int:
         """Stop it, after `ends_s` [s] by killing, and return its exit code."""
-        self._stopped = True
+        self.stopped = True
         if self._child.poll() is None:
             self._signal(signal.SIGTERM)
             try:
@@ -96,16 +89,13 @@ class LocalProcess:
                 self._signal(signal.SIGKILL)
                 self._child.wait(_KILLED_S)
         self._reader.join(_KILLED_S)
-        if self._child.stdin is not None:
-            with suppress(OSError):  # what was not read any more
-                self._child.stdin.close()
+        with suppress(OSError):  # what was not read any more
+            self._keyboard.close()
         return self._child.returncode
 
     def _signal(self, number: int) -> None:
-        try:
+        with suppress(ProcessLookupError):  # ended by itself
             os.killpg(self._child.pid, number)
-        except ProcessLookupError:
-            return  # ended by itself
 
     def _read(self, output: IO[bytes]) -> None:
         decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")
@@ -126,7 +116,6 @@ class LocalProcesses:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._all: dict[str, LocalProcess] = {}
-        self._shared: dict[type, object] = {}
         try:
             self._supervisor = subprocess.Popen(
                 [sys.executable, "-m", "master.console.process_supervisor"],
@@ -136,15 +125,19 @@ class LocalProcesses:
             )
         except OSError as error:
             raise PhalanxError(f"console: cannot start {sys.executable}: {error.strerror}") from error
+        assert self._supervisor.stdin is not None
+        self._list = self._supervisor.stdin
 
-    def start(self, name: str, command: Sequence[str], environment: Mapping[str, str]) -> LocalProcess:
+    def start(
+        self, name: str, command: Sequence[str], environment: Mapping[str, str] | None = None
+    ) -> LocalProcess:
         """Start a command under a name; one of that name that still runs is ended first.
 
         Raises:
             PhalanxError: The program cannot be started.
         """
         self.stop(name)
-        process = LocalProcess(name, command, environment)
+        process = LocalProcess(name, command, environment or {})
         self._send(f"+{process.pid}")
         with self._lock:
             self._all[name] = process
@@ -160,34 +153,23 @@ class LocalProcesses:
         with self._lock:
             return {name: one for name, one in self._all.items() if one.ended() is None}
 
-    def shared(self, kind: type[T], make: Callable[[], T]) -> T:
-        """Return the one object of a type that all pages share, made when first asked."""
-        with self._lock:
-            found = self._shared.get(kind)
-            if not isinstance(found, kind):
-                self._shared[kind] = found = make()
-            return found
-
-    def stop(self, name: str) -> None:
-        """End one and wait until it has; nothing happens if there is none."""
+    def tail(self, name: str, count: int) -> str:
+        """The last lines of a process; empty if there is none."""
         process = self.get(name)
-        if process is None:
-            return
-        process.stop()
-        self._send(f"-{process.pid}")
+        return "" if process is None else "\n".join(process.tail(count))
+
+    def stop(self, *names: str) -> None:
+        """End processes, all at once, and wait until they have; none: nothing happens."""
+        processes = [process for name in names if (process := self.get(name)) is not None]
+        with ThreadPoolExecutor(max(len(processes), 1)) as threads:
+            for process, _ in zip(processes, threads.map(LocalProcess.stop, processes), strict=True):
+                self._send(f"-{process.pid}")
 
     def close(self) -> None:
-        """End all processes at once, then the supervisor. Safe to call twice."""
-        running = list(self.running().values())
-        stoppers = [threading.Thread(target=one.stop, daemon=True) for one in running]
-        for thread in stoppers:
-            thread.start()
-        for thread in stoppers:
-            thread.join(ENDS_S + _KILLED_S)
-        for one in running:
-            self._send(f"-{one.pid}")
-        if self._supervisor.stdin is not None and not self._supervisor.stdin.closed:
-            self._supervisor.stdin.close()
+        """End all processes, then the supervisor. Safe to call twice."""
+        self.stop(*self.running())
+        with suppress(OSError):
+            self._list.close()
         try:
             self._supervisor.wait(ENDS_S + _KILLED_S)
         except subprocess.TimeoutExpired:
@@ -195,11 +177,7 @@ class LocalProcesses:
             self._supervisor.wait(_KILLED_S)
 
     def _send(self, line: str) -> None:
-        pipe = self._supervisor.stdin
-        if pipe is None or pipe.closed:
-            return
-        try:
-            pipe.write(line + "\n")
-            pipe.flush()
-        except OSError:
-            return  # the supervisor was killed: the processes still end with `close`
+        # Closed, or the supervisor was killed: the processes still end with `close`.
+        with suppress(OSError, ValueError):
+            self._list.write(line + "\n")
+            self._list.flush()

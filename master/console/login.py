@@ -18,7 +18,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass, field
-from ipaddress import IPv6Address, ip_address, ip_network
+from ipaddress import IPv6Address, ip_network
 from pathlib import Path
 from string import Template
 from urllib.parse import parse_qs, quote
@@ -28,6 +28,7 @@ from starlette.responses import HTMLResponse, PlainTextResponse, RedirectRespons
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from common.errors import PhalanxError
+from master.console.serving import plain_address
 from master.outputs.web.listening import read_private, write_private
 
 HASH_FILE = "console.password"
@@ -173,9 +174,6 @@ class Sessions:
         if (session := self._by_hash.pop(_hash(token), None)) is not None:
             session.ended.set()
 
-    def __len__(self) -> int:
-        return len(self._by_hash)
-
 
 class Backoff:
     """Failed logins per address, with the time until which each must wait.
@@ -218,14 +216,10 @@ def _hash(token: str) -> bytes:
 def _network(address: str) -> str:
     """Return the network whose tries count as one: an IPv4 address, or an IPv6 /64."""
     try:
-        found = ip_address(address.split("%", 1)[0])
+        found = plain_address(address)
     except ValueError:
         return address
-    if isinstance(found, IPv6Address):
-        if found.ipv4_mapped is not None:
-            return str(found.ipv4_mapped)
-        return str(ip_network((found, 64), strict=False))
-    return str(found)
+    return str(ip_network((found, 64), strict=False) if isinstance(found, IPv6Address) else found)
 
 
 LOGIN, LOGOUT = "/login", "/logout"

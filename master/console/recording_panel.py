@@ -4,10 +4,8 @@ The recorder and the player are processes of their own; recordings lie in one fo
 tree. What is played takes the place of a master; pause, seek and speed go to whichever player runs.
 """
 
-import asyncio
 import json
 import re
-import sys
 import time
 from collections.abc import Callable, Mapping
 from datetime import datetime
@@ -20,7 +18,7 @@ from nicegui.events import GenericEventArguments
 from common.errors import PhalanxError
 from common.messages import Command, Health
 from common.messages.streams import MASTER
-from master.console.controls import CommandQueue, every
+from master.console.controls import CommandQueue, Problem, every, offer, panel
 from master.console.state import ConsoleState
 
 PROCESS = "record"
@@ -59,8 +57,7 @@ def start_recording(state: ConsoleState, name: str, previews: bool) -> Path:
         raise PhalanxError(f"{path.parent}: cannot be made: {error.strerror}") from error
     rigs = [word for rig in state.rig_names for word in ("--rig", rig)]
     tree = ["--calibration", str(state.settings.calibration), "--bus", state.settings.bus]
-    words = ["record", str(path), *rigs, *tree, *(["--previews"] if previews else [])]
-    state.local.start(PROCESS, [sys.executable, "-m", "master", *words], {})
+    state.start(PROCESS, "record", str(path), *rigs, *tree, *(["--previews"] if previews else []))
     return path
 
 
@@ -77,18 +74,17 @@ def progress_words(report: Health | None) -> str:
 
 def recording_panel(state: ConsoleState) -> None:
     """Build the panel."""
-    with ui.element("section").classes("panel").props('aria-label="Recording"'):
-        ui.label("Recording").classes("panel-title")
+    with panel("Recording"):
         with ui.row().classes("items-center gap-3"):
             name = ui.input("Name", value=_new_name()).props("dense outlined")
             previews = ui.switch("with small pictures").props("dense")
-            button = ui.button("Record", icon="fiber_manual_record").props("unelevated color=negative")
+            button = ui.button().props("unelevated color=negative")
         status = ui.label("").classes("record-status").props('role="status"')
-        error = ui.label("").classes("problem").props('role="alert"')
+        problem = Problem()
 
     async def toggle() -> None:
         wanted, small = str(name.value or ""), bool(previews.value)
-        if await _toggle(state, PROCESS, lambda: start_recording(state, wanted, small), button, error):
+        if await _toggle(state, PROCESS, lambda: start_recording(state, wanted, small), button, problem):
             name.set_value(_new_name())
 
     button.on_click(toggle)
@@ -97,29 +93,21 @@ def recording_panel(state: ConsoleState) -> None:
         running = PROCESS in state.local.running()
         button.set_text("Stop recording" if running else "Record")
         button.set_icon("stop" if running else "fiber_manual_record")
-        process = state.local.get(PROCESS)
         words = progress_words(state.health.get(RECORDER))
-        if words or process is None:
-            status.set_text(words and f"recording: {words}")
-        else:
-            status.set_text("\n".join(process.tail(3)) or ("starting …" if running else ""))
+        last = state.local.tail(PROCESS, 3) or "starting …" * running
+        status.set_text(f"recording: {words}" if words else last)
 
     every(0.5, update)
 
 
 async def _toggle(
-    state: ConsoleState, process: str, start: Callable[[], object], button: ui.button, error: ui.label
+    state: ConsoleState, process: str, start: Callable[[], object], button: ui.button, problem: Problem
 ) -> bool:
     """Stop a process that runs, else start it, and return whether it was stopped."""
-    error.set_text("")
     button.disable()
+    runs = process in state.local.running()
     try:
-        runs = process in state.local.running()
-        await asyncio.to_thread((lambda: state.local.stop(process)) if runs else start)
-        return runs
-    except PhalanxError as problem:
-        error.set_text(str(problem))
-        return False
+        return await problem.attempt((lambda: state.local.stop(process)) if runs else start) and runs
     finally:
         button.enable()
 
@@ -155,17 +143,15 @@ def start_playing(state: ConsoleState, name: str) -> None:
             "a master runs: end it on the Set-up page first, a recording is played in its place"
         )
     file = recordings_folder(state) / f"{name}.mcap"
-    state.local.start(
-        PLAYBACK, [sys.executable, "-m", "master", "play", str(file), "--bus", state.settings.bus], {}
-    )
+    state.start(PLAYBACK, "play", str(file), "--bus", state.settings.bus)
 
 
 class Controls:
     """Pause, position and speed of whichever player is on the bus."""
 
-    def __init__(self, state: ConsoleState, notify: Callable[[str], object]) -> None:
-        """Build the controls; `notify` receives why a command was refused, or nothing."""
-        self._state, self._notify = state, notify
+    def __init__(self, state: ConsoleState, problem: Problem) -> None:
+        """Build the controls; `problem` shows why a command was refused."""
+        self._state, self._problem = state, problem
         self._answer: Health | None = None
         self._at, self._speed, self._paused = 0.0, 1.0, False
         self._wanted_s: float | None = None
@@ -178,7 +164,7 @@ class Controls:
                 self._words = ui.label("").classes("mono play-at")
             self._speeds = ui.select(_SPEEDS, value=1.0, label="Speed").props("dense outlined")
             self._speeds.classes("known-poses")
-        self._command_queue = CommandQueue(self._send, self._on_answer, notify)
+        self._command_queue = CommandQueue(self._send, self._on_answer, problem.show)
         self._pause.on_click(lambda: self._command_queue.change("resume" if self._paused else "pause", None))
         self._slider.on_value_change(self._dragged)
         self._slider.on("change", self._sought)  # when it is let go, or its key
@@ -225,7 +211,7 @@ class Controls:
 
     def _on_answer(self, answer: Health | None) -> None:
         self._answer = answer
-        self._notify("")
+        self._problem.set_text("")
 
     def _dragged(self) -> None:
         value = self._slider.value
@@ -247,31 +233,27 @@ class Controls:
 
 def play_panel(state: ConsoleState) -> None:
     """Build the panel."""
-    with ui.element("section").classes("panel").props('aria-label="Playing"'):
-        ui.label("Playing").classes("panel-title")
+    with panel("Playing"):
         with ui.row().classes("items-center gap-3"):
             which = ui.select(recordings(state), label="Recording").props("dense outlined")
             which.classes("known-poses")
-            play = ui.button("Play", icon="play_circle").props("unelevated")
-        error = ui.label("").classes("problem").props('role="alert"')
-        controls = Controls(state, error.set_text)
+            button = ui.button().props("unelevated")
+        problem = Problem()
+        controls = Controls(state, problem)
         log = ui.label("").classes("mono").props('role="log" aria-label="Messages of the player"')
 
     async def toggle() -> None:
         wanted = str(which.value or "")
-        await _toggle(state, PLAYBACK, lambda: start_playing(state, wanted), play, error)
+        await _toggle(state, PLAYBACK, lambda: start_playing(state, wanted), button, problem)
 
-    play.on_click(toggle)
+    button.on_click(toggle)
 
     def update() -> None:
         running = PLAYBACK in state.local.running()
-        play.set_text("Stop" if running else "Play")
-        play.set_icon("stop" if running else "play_circle")
-        names = recordings(state)
-        if which.options != names:
-            which.set_options(names, value=which.value if which.value in names else None)
+        button.set_text("Stop" if running else "Play")
+        button.set_icon("stop" if running else "play_circle")
+        offer(which, recordings(state))
         controls.update()
-        process = state.local.get(PLAYBACK)
-        log.set_text("" if process is None else "\n".join(process.tail(3)) or "starting …" * running)
+        log.set_text(state.local.tail(PLAYBACK, 3) or "starting …" * running)
 
     every(0.5, update)

@@ -15,14 +15,17 @@ import socket
 import ssl
 import sys
 from collections.abc import Callable, Collection, MutableMapping
-from ipaddress import IPv6Address, ip_address
+from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
 from typing import Any, cast
 from urllib.parse import urlsplit
 
 import uvicorn
 from fastapi import FastAPI
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocketClose
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from master.outputs.web.listening import machine_names
@@ -134,13 +137,16 @@ def console_server(app: FastAPI, tls: ssl.SSLContext | None) -> ConsoleServer:
 LOOPBACK = frozenset({"127.0.0.1", "localhost", "[::1]"})
 ANYWHERE = frozenset({"0.0.0.0", "::"})
 Peer = tuple[str, int]
-_NO = b"refused: this console answers only to its own pages\n"
+_NO = "refused: this console answers only to its own pages\n"
 _NOT_YOU = (
-    b"refused: this console belongs to another user of this machine, and has no password\n"
-    b"(its owner can start it with --password-file)\n"
+    "refused: this console belongs to another user of this machine, and has no password\n"
+    "(its owner can start it with --password-file)\n"
 )
-_FRAMES = ((b"x-frame-options", b"DENY"), (b"x-content-type-options", b"nosniff"))
-_NO_FRAMES = (b"content-security-policy", b"frame-ancestors 'none'")
+_HEADERS = {
+    "x-frame-options": "DENY",
+    "x-content-type-options": "nosniff",
+    "content-security-policy": "frame-ancestors 'none'",
+}
 
 
 def refusal(
@@ -196,14 +202,15 @@ class OwnPagesOnly:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
-        words = (b"host", b"origin", b"sec-fetch-site", b"sec-fetch-mode")
-        host, origin, site, mode = (_header(scope, word) for word in words)
+        headers = Headers(raw=list(scope["headers"]))
+        names = ("host", "origin", "sec-fetch-site", "sec-fetch-mode")
+        host, origin, site, mode = (headers.get(name) for name in names)
         if refusal(host, origin, self._allowed, site, mode) is not None:
-            await _refuse(scope, send, _NO)
+            await _refuse(scope, receive, send, _NO)
         elif self._same_user is not None and not self._same_user(
             _peer(scope, "client"), _peer(scope, "server")
         ):
-            await _refuse(scope, send, _NOT_YOU)
+            await _refuse(scope, receive, send, _NOT_YOU)
         else:
             await self._app(scope, receive, _unframed(send) if scope["type"] == "http" else send)
 
@@ -211,21 +218,19 @@ class OwnPagesOnly:
 def _unframed(send: Send) -> Send:
     async def send_unframed(message: Message) -> None:
         if message["type"] == "http.response.start":
-            headers = list(message.get("headers", ()))
-            have = {name.lower() for name, _ in headers}
-            headers += [one for one in (*_FRAMES, _NO_FRAMES) if one[0] not in have]
-            message = {**message, "headers": headers}
+            headers = MutableHeaders(raw=list(message.get("headers", ())))
+            for name, value in _HEADERS.items():
+                headers.setdefault(name, value)
+            message = {**message, "headers": headers.raw}
         await send(message)
 
     return send_unframed
 
 
-async def _refuse(scope: Scope, send: Send, why: bytes) -> None:
-    if scope["type"] == "websocket":
-        await send({"type": "websocket.close", "code": 1008})
-        return
-    await send({"type": "http.response.start", "status": 403, "headers": [(b"content-type", b"text/plain")]})
-    await send({"type": "http.response.body", "body": why})
+async def _refuse(scope: Scope, receive: Receive, send: Send, why: str) -> None:
+    http = scope["type"] == "http"
+    answer = PlainTextResponse(why, 403) if http else WebSocketClose(1008)
+    await answer(scope, receive, send)
 
 
 def _is_address(name: str) -> bool:
@@ -241,12 +246,6 @@ def _peer(scope: MutableMapping[str, Any], side: str) -> Peer:
     return str(found[0]), int(found[1] or 0)
 
 
-def _header(scope: MutableMapping[str, Any], name: bytes) -> str | None:
-    found = [value for key, value in scope["headers"] if key == name]
-    return found[0].decode("latin-1") if found else None
-
-
-_TABLES = ("tcp", "tcp6")
 _WORD = 8  # hexadecimal digits of 32 bits, which the kernel writes in the machine's own byte order
 
 
@@ -256,7 +255,7 @@ def same_user(client: Peer, server: Peer, net: Path = Path("/proc/net")) -> bool
     Both ends as the server sees them; `net` has the kernel's tables of sockets. True where the system has
     none.
     """
-    tables = [path for name in _TABLES if (path := net / name).exists()]
+    tables = [path for name in ("tcp", "tcp6") if (path := net / name).exists()]
     if not tables:
         return True  # no Linux
     wanted = (_plain(client), _plain(server))
@@ -272,11 +271,18 @@ def same_user(client: Peer, server: Peer, net: Path = Path("/proc/net")) -> bool
     return False
 
 
+def plain_address(text: str) -> IPv4Address | IPv6Address:
+    """An address without its zone; one of IPv4 that is mapped into IPv6 as it is.
+
+    Raises:
+        ValueError: It is none.
+    """
+    address = ip_address(text.split("%", 1)[0])
+    return (isinstance(address, IPv6Address) and address.ipv4_mapped) or address
+
+
 def _plain(peer: Peer) -> Peer:
-    address = ip_address(peer[0].split("%", 1)[0])
-    if isinstance(address, IPv6Address) and address.ipv4_mapped is not None:
-        address = address.ipv4_mapped
-    return str(address), peer[1]
+    return str(plain_address(peer[0])), peer[1]
 
 
 def _socket(text: str) -> Peer:

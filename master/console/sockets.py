@@ -6,15 +6,16 @@ ones. An open socket is a look at the camera: when it closes, the camera stops s
 
 import asyncio
 import struct
-from collections.abc import AsyncGenerator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager, suppress
 from typing import Annotated
 
 import msgspec
 from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 from nicegui import app as nicegui_app
 
-from common.messages import MAX_MARKERS, HandPose, Name, ObjectPose
+from common.messages import MAX_MARKERS, HandPose, Name
+from common.messages.streams import sender_of
 from master.console.state import ConsoleState
 from master.outputs.web import object_json, static_dir, three_js_path, webxr_json
 
@@ -22,7 +23,7 @@ _POLL_S = 0.03
 _TIME = struct.Struct(">q")  # before each picture: when it was taken [ns]
 
 
-class _Wish(msgspec.Struct):
+class _MaskRequest(msgspec.Struct):
     mask: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MAX_MARKERS)]
 
 
@@ -38,14 +39,8 @@ class Shown:
         if text == "next":
             self.ready = True
         elif len(text) <= 8192:
-            self.mask = _mask(text, self.mask)
-
-
-def _mask(text: str, before: tuple[str, ...]) -> tuple[str, ...]:
-    try:
-        return msgspec.json.decode(text, type=_Wish).mask
-    except (msgspec.MsgspecError, RecursionError):
-        return before
+            with suppress(msgspec.MsgspecError, RecursionError):
+                self.mask = msgspec.json.decode(text, type=_MaskRequest).mask
 
 
 def serve_sockets(app: FastAPI, state: ConsoleState) -> None:
@@ -54,7 +49,7 @@ def serve_sockets(app: FastAPI, state: ConsoleState) -> None:
     nicegui_app.add_static_files("/hand-view", static_dir())
 
     async def camera_socket(socket: WebSocket, camera: str) -> None:
-        if camera not in state.cameras():
+        if camera not in {*state.cameras(), *state.alive}:
             not_ours = 4004
             await socket.close(not_ours)
             return
@@ -114,36 +109,16 @@ async def _send_pictures(socket: WebSocket, state: ConsoleState, camera: str, sh
 
 
 async def _send_hands(socket: WebSocket, state: ConsoleState, shown: Shown) -> None:
-    last: dict[str, int] = {}
+    last: dict[tuple[str, str], int] = {}  # (type, name) -> time of the pose that was sent
     while True:
-        if shown.ready:
-            lines = _new_lines(state.poses, last, _hand_line) + _new_lines(state.objects, last, _object_line)
-            if lines:
-                shown.ready = False
-                await socket.send_text("\n".join(lines))
+        new = [
+            pose
+            for pose in (*state.poses.values(), *state.objects.values())
+            if last.get((type(pose).__name__, sender_of(pose))) != pose.t_ns
+        ]
+        if shown.ready and new:
+            last |= {(type(pose).__name__, sender_of(pose)): pose.t_ns for pose in new}
+            shown.ready = False
+            lines = [webxr_json(pose) if isinstance(pose, HandPose) else object_json(pose) for pose in new]
+            await socket.send_text(b"\n".join(lines).decode())
         await asyncio.sleep(_POLL_S)
-
-
-def _new_lines(
-    poses: dict[str, HandPose] | dict[str, ObjectPose],
-    last: dict[str, int],
-    line: Callable[[HandPose | ObjectPose], str],
-) -> list[str]:
-    """What was not sent yet, one line each."""
-    out: list[str] = []
-    for name, pose in poses.items():
-        key = f"{type(pose).__name__} {name}"
-        if last.get(key) != pose.t_ns:
-            last[key] = pose.t_ns
-            out.append(line(pose))
-    return out
-
-
-def _hand_line(pose: HandPose | ObjectPose) -> str:
-    assert isinstance(pose, HandPose)
-    return webxr_json(pose).decode()
-
-
-def _object_line(pose: HandPose | ObjectPose) -> str:
-    assert isinstance(pose, ObjectPose)
-    return object_json(pose).decode()

@@ -6,6 +6,7 @@ it and hold no data.
 """
 
 import math
+import sys
 import threading
 import time
 from collections import deque
@@ -20,9 +21,9 @@ from common.bus.bus import Bus
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import CalibrationError
 from common.messages import Checklist, Contact, Gesture, HandPose, Health, Message, ObjectPose, Preview
-from common.messages.streams import MASTER
+from common.messages.streams import MASTER, sender_of
 from master.commands.options import HERE_BEACON, HERE_BIND, HERE_BUS
-from master.console.controls import Tuner
+from master.console.controls import InUse, Tuner, full_frame_uv
 from master.console.link import Link, PictureSizes, PreviewLeases
 from master.console.local import LocalProcesses
 from master.run.process import join_bus
@@ -122,55 +123,71 @@ def _of_sender(source: str, report: Health) -> dict[str, float]:
     return {f"celsius.{source}": max(hot)} if hot else {}
 
 
+STALE_S = 3.0  # what was not reported again for so long is no longer shown as present
+KeyT = TypeVar("KeyT")
+MessageT = TypeVar("MessageT", bound=Message)
+
+
+class Newest(Generic[KeyT, MessageT]):
+    """Newest message of each sender, at most 64, with its time of receipt."""
+
+    def __init__(self) -> None:
+        self._received: dict[KeyT, tuple[float, MessageT]] = {}
+
+    def put(self, name: KeyT, message: MessageT, now_s: float | None = None) -> None:
+        """Receive one message, at `now_s` [s], monotonic; by default now."""
+        max_names = 64  # kept of each kind: a bus on which names are invented costs no memory
+        if name in self._received or len(self._received) < max_names:
+            self._received[name] = (time.monotonic() if now_s is None else now_s, message)
+
+    def drop(self, name: KeyT) -> None:
+        """Forget the message of one sender."""
+        self._received.pop(name, None)
+
+    def get(self, name: KeyT, within_s: float = STALE_S) -> MessageT | None:
+        """The newest of one sender, unless it is older than `within_s`."""
+        return self.present(within_s).get(name)
+
+    def present(self, within_s: float = STALE_S, now_s: float | None = None) -> dict[KeyT, MessageT]:
+        """Return the newest message of each sender received recently."""
+        now_s = time.monotonic() if now_s is None else now_s
+        return {
+            name: one
+            for name, (received_s, one) in list(self._received.items())
+            if now_s - received_s < within_s
+        }
+
+
 KEPT = 30
-
-
-@dataclass(frozen=True, slots=True)
-class ReceivedGesture:
-    """Message that began or ended a gesture, with its time of receipt [s, monotonic]."""
-
-    received_s: float
-    gesture: Gesture
 
 
 class ReceivedGestures:
     """Newest message of each lasting gesture, and the last begins, ends and taps."""
 
     def __init__(self) -> None:
-        self._held: dict[tuple[str, str], ReceivedGesture] = {}
-        self._events: deque[ReceivedGesture] = deque(maxlen=KEPT)
+        self._held = Newest[tuple[str, str], Gesture]()
+        self._events: deque[tuple[float, Gesture]] = deque(maxlen=KEPT)
 
     def push(self, gesture: Gesture, now_s: float) -> None:
         """Receive one message at `now_s` [s], monotonic."""
         key = (gesture.hand, gesture.kind)
-        received = ReceivedGesture(now_s, gesture)
         if gesture.phase != "update":
-            self._events.append(received)
-        most = 64
+            self._events.append((now_s, gesture))
         if gesture.phase == "end":
-            self._held.pop(key, None)
-        elif key in self._held or len(self._held) < most:
-            self._held[key] = received
+            self._held.drop(key)
+        else:
+            self._held.put(key, gesture, now_s)
 
     def held(self, now_s: float | None = None) -> dict[tuple[str, str], Gesture]:
         """(hand, kind) -> what lasts at `now_s` [s], by default now."""
-        now_s = time.monotonic() if now_s is None else now_s
-        # a gesture is repeated with every pose of its hand: not received for so long, it is over
-        hold_s = 0.5
-        return {
-            key: received.gesture
-            for key, received in list(self._held.items())
-            if now_s - received.received_s < hold_s
-        }
+        hold_s = (
+            0.5  # a gesture is repeated with every pose of its hand: not received for so long, it is over
+        )
+        return self._held.present(hold_s, now_s)
 
-    def events(self) -> list[ReceivedGesture]:
-        """The last begins, ends and taps, newest first."""
+    def events(self) -> list[tuple[float, Gesture]]:
+        """The last begins, ends and taps with their times of receipt, newest first."""
         return list(self._events)[::-1]
-
-
-STALE_S = 3.0  # what was not reported again for so long is no longer shown as present
-
-MessageT = TypeVar("MessageT", bound=Message)
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,33 +218,6 @@ class ConsoleSettings:
     open_links: bool = False
 
 
-class Newest(Generic[MessageT]):
-    """Newest message of each sender, at most 64, with its time of receipt."""
-
-    def __init__(self) -> None:
-        self._received: dict[str, tuple[float, MessageT]] = {}
-
-    def put(self, name: str, message: MessageT) -> None:
-        """Receive one message."""
-        max_names = 64  # kept of each kind: a bus on which names are invented costs no memory
-        if name in self._received or len(self._received) < max_names:
-            self._received[name] = (time.monotonic(), message)
-
-    def get(self, name: str, within_s: float = STALE_S) -> MessageT | None:
-        """The newest of one sender, unless it is older than `within_s`."""
-        received_s, message = self._received.get(name, (-within_s, None))
-        return message if time.monotonic() - received_s < within_s else None
-
-    def present(self, within_s: float = STALE_S) -> dict[str, MessageT]:
-        """Return the newest message of each sender received recently."""
-        now_s = time.monotonic()
-        return {
-            name: one
-            for name, (received_s, one) in list(self._received.items())
-            if now_s - received_s < within_s
-        }
-
-
 class ConsoleState:
     """Link to the bus, newest messages, the last minute's figures, local processes."""
 
@@ -237,16 +227,14 @@ class ConsoleState:
         self.history = History()
         self.received_gestures = ReceivedGestures()
         self.local = LocalProcesses()
-        self._poses, self._health = Newest[HandPose](), Newest[Health]()
-        self._objects, self._contacts = Newest[ObjectPose](), Newest[Contact]()
-        self._previews, self._checklists = Newest[Preview](), Newest[Checklist]()
+        self._poses, self._health = Newest[str, HandPose](), Newest[str, Health]()
+        self._objects, self._contacts = Newest[str, ObjectPose](), Newest[str, Contact]()
+        self._previews, self._checklists = Newest[str, Preview](), Newest[str, Checklist]()
         self._latencies_ms: deque[float] = deque(maxlen=4096)
         self._closing = threading.Event()
         self._sizes = PictureSizes(self.camera)
         streams = ("hand", "object", "contact", "gesture", "health", "checklist", "preview")
-        self.link = Link(
-            open_bus or (lambda: join_bus(settings.bus)), dict.fromkeys(streams, self.on_message)
-        )
+        self.link = Link(open_bus or (lambda: join_bus(settings.bus)), streams, self.on_message)
         self._preview_leases = PreviewLeases(self.link.ask)
         self._tuners: dict[str, Tuner] = {}
         self._sampler = threading.Thread(target=self._sample, name="console history", daemon=True)
@@ -302,8 +290,25 @@ class ConsoleState:
     def tuner(self, camera: str) -> Tuner:
         """Return a camera's tuner, one for all pages: all revert to the same settings."""
         if camera not in self._tuners:
-            self._tuners[camera] = Tuner(camera, self.link.ask)
+            self._tuners[camera] = Tuner(camera, self.link.ask, self.camera_path(camera))
         return self._tuners[camera]
+
+    def pick(self, camera: str, marker: str, x: float, y: float, t_ns: int) -> InUse:
+        """Sample a marker's colour at a place in a camera's picture, in shares of it.
+
+        Raises:
+            PhalanxError: The camera's file is missing or broken, or as of `Tuner.pick`.
+        """
+        file = self.camera(camera)
+        return self.tuner(camera).pick(marker, full_frame_uv(x, y, file.width_px, file.height_px), t_ns)
+
+    def start(self, name: str, *words: str) -> None:
+        """Start a command of `phalanx` on this machine as the process `name`.
+
+        Raises:
+            PhalanxError: It cannot be started.
+        """
+        self.local.start(name, [sys.executable, "-m", "master", *words])
 
     @property
     def rig_names(self) -> tuple[str, ...]:
@@ -333,6 +338,10 @@ class ConsoleState:
         named = tuple(dict.fromkeys(camera for rig in self.rigs().values() for camera in rig.cameras))
         return named or tuple(sorted(name for name, one in self.health.items() if "frames" in one.counts))
 
+    def markers_of(self, camera: str) -> tuple[str, ...]:
+        """Markers of the rigs of a camera."""
+        return tuple(name for rig in self.rigs().values() if camera in rig.cameras for name in rig.markers)
+
     def camera(self, name: str) -> CameraCalibration:
         """The file of a camera on this machine.
 
@@ -350,23 +359,24 @@ class ConsoleState:
 
     def on_message(self, message: Message) -> None:
         """Take one message from the bus; from any thread."""
+        name = sender_of(message)
         match message:
             case HandPose():
                 self._latencies_ms.append(message.latency_ns * 1e-6)
-                self._poses.put(message.hand, message)
+                self._poses.put(name, message)
             case Health():
-                self._health.put(message.source, message)
+                self._health.put(name, message)
             case ObjectPose():
-                self._objects.put(message.object, message)
+                self._objects.put(name, message)
             case Contact():
                 self._contacts.put(f"{message.hand}/{message.object}", message)
             case Gesture():
                 self.received_gestures.push(message, time.monotonic())
             case Preview():
                 if self._sizes.fits(message):
-                    self._previews.put(message.camera, message)
+                    self._previews.put(name, message)
             case Checklist():
-                self._checklists.put(message.source, message)
+                self._checklists.put(name, message)
             case _:
                 pass
 

@@ -27,12 +27,14 @@ from math import acos, cos, sqrt
 from common.arrays import Bool, Float, Int
 from common.hand.model import CHAINS
 from common.kernels import constant, inlined, inner
-from common.records import record
+from common.records import array
 from master.estimator.kinematics import (
     DIRECTION,
     PLACE,
     Scratch,
     finger_jacobian,
+    hinge_axis,
+    marker_jacobian,
     marker_point,
     palm_jacobian,
 )
@@ -40,64 +42,38 @@ from master.estimator.parameters import HandTables
 from master.estimator.problem import Rig
 from master.estimator.settings import Settings
 from master.estimator.state import Hidden
-from master.fabrik.linear_algebra import cholesky, eigen
+from master.fabrik.joints import START, put_vector, vector_at
+from master.fabrik.linear_algebra import Vector, cholesky, eigen, minus, plus
 
 _LAST = constant(3)  # joint of a finger: its tip
 MOST_ROTATIONS = 12  # turns that count in arcs: those of the palm, which moves all joints, then the largest
+_PAIRS = MOST_ROTATIONS * (MOST_ROTATIONS + 1) // 2
 
 
 class CovarianceScratch:
     """Scratch for N unknowns and M markers."""
 
-    A: Float  # (N, N)
-    L: Float  # (N, N)
-    V: Float  # (N, N)
-    work: Float  # (N, N)
-    values: Float  # (N,)
-    rotations: Float  # (12, N) columns of the factor, as rows
-    left: Float  # (N,)
-    w: Float  # (5, 4, 12, 3)
-    joint: Float  # (78, 26, 3) arcs of joints, by pair
-    marker: Float  # (78, 3 M) of markers, whitened
-    Jm: Float  # (3 M, N)
-    gain: Float  # (N, 3 M)
-    B: Float  # (3 M, 3 M)
-    BL: Float  # (3 M, 3 M)
-    BV: Float  # (3 M, 3 M)
-    B_values: Float  # (3 M,)
-    row: Float  # (3 M,)
-    white: Float  # (3, 3)
-    C: Float  # (10, 3)
-    J: Float  # (10, 3)
-    at: Int  # (10,)
-    joint_of: Int  # (5, 4) the joints of the chains
-
-    @classmethod
-    def empty(cls, N: int, markers: int) -> "CovarianceScratch":
-        """Allocate it."""
-        K, pairs = 3 * markers, MOST_ROTATIONS * (MOST_ROTATIONS + 1) // 2
-        scratch = record(
-            cls,
-            **dict.fromkeys(("A", "L", "V", "work"), (N, N)),
-            **dict.fromkeys(("B", "BL", "BV"), (K, K)),
-            values=N,
-            left=N,
-            rotations=(MOST_ROTATIONS, N),
-            w=(5, 4, MOST_ROTATIONS, 3),
-            joint=(pairs, 26, 3),
-            marker=(pairs, K),
-            Jm=(K, N),
-            gain=(N, K),
-            B_values=K,
-            row=K,
-            white=(3, 3),
-            C=(10, 3),
-            J=(10, 3),
-            at=("i8", 10),
-            joint_of=("i8", (5, 4)),
-        )
-        scratch.joint_of[:] = CHAINS
-        return scratch
+    A: Float = array("N", "N")
+    L: Float = array("N", "N")
+    V: Float = array("N", "N")
+    work: Float = array("N", "N")
+    values: Float = array("N")
+    rotations: Float = array(MOST_ROTATIONS, "N")  # columns of the factor, as rows
+    left: Float = array("N")
+    w: Float = array(5, 4, MOST_ROTATIONS, 3)
+    joint: Float = array(_PAIRS, 26, 3)  # arcs of joints, by pair
+    marker: Float = array(_PAIRS, "3M")  # of markers, whitened
+    Jm: Float = array("3M", "N")
+    gain: Float = array("N", "3M")
+    B: Float = array("3M", "3M")
+    BL: Float = array("3M", "3M")
+    BV: Float = array("3M", "3M")
+    B_values: Float = array("3M")
+    row: Float = array("3M")
+    white: Float = array(3, 3)
+    C: Float = array(10, 3)
+    J: Float = array(10, 3)
+    at: Int = array(10, kind="i8")
 
 
 @inner
@@ -168,7 +144,7 @@ def joint_jacobian(hand: HandTables, joint: int, T: Float, work: Scratch, scratc
     if f < 0:
         return 6
     count = int(hand.first[f + 1] - hand.first[f])
-    finger_jacobian(hand, work.by, T, work.R, work.P, f, level, work.point, PLACE, scratch.J)
+    finger_jacobian(hand, T, work, f, level, work.point, PLACE, scratch.J)
     for c in range(count):
         scratch.at[6 + c] = 6 + hand.first[f] + c
     return 6 + count
@@ -203,8 +179,7 @@ def linear(
 
 @inner
 def tilts(
-    hand: HandTables,
-    settings: Settings,
+    rig: Rig,
     T: Float,
     cov: Float,
     work: Scratch,
@@ -213,6 +188,7 @@ def tilts(
     process_noise: Float,
 ) -> None:
     """Write the last phalanges' covariances (5, 3, 3) [rad^2] and walk [rad^2/s^2]."""
+    hand, settings = rig.hand, rig.settings
     for f in range(5):
         squared = 0.0
         for i in range(3):
@@ -221,7 +197,7 @@ def tilts(
         for i in range(3):
             work.ahead[i] /= sqrt(squared)
         palm_jacobian(work.ahead, scratch.J)
-        finger_jacobian(hand, work.by, T, work.R, work.P, f, _LAST, work.ahead, DIRECTION, scratch.J)
+        finger_jacobian(hand, T, work, f, _LAST, work.ahead, DIRECTION, scratch.J)
         count = hand.first[f + 1] - hand.first[f]
         for a in range(6 + count):
             scratch.at[a] = a if a < 6 else hand.first[f] + a
@@ -308,14 +284,7 @@ def _bone_rotations(
             for i in range(3):
                 scratch.w[f, 0, k, i] = scale * scratch.rotations[k, i]
         for axis in range(4):
-            ax, ay, az = -work.R[f, max(axis - 1, 0), 0, 0], -work.R[f, max(axis - 1, 0), 1, 0], 0.0
-            az = -work.R[f, max(axis - 1, 0), 2, 0]
-            if axis == 0:
-                ax = ay = az = 0.0
-                for j in range(3):
-                    ax += T[0, j] * hand.abduction_axis[f, j]
-                    ay += T[1, j] * hand.abduction_axis[f, j]
-                    az += T[2, j] * hand.abduction_axis[f, j]
+            ax, ay, az = hinge_axis(hand, T, work.R[f], f, axis)
             # Abduction and flexion turn the first bone behind the root, PIP the next, DIP the last.
             bone, before = max(axis, 1), max(axis - 1, 0)
             for k in range(count):
@@ -332,13 +301,17 @@ def _bone_rotations(
 
 
 @inlined
-def _second_derivative(one: Float, other: Float, bx: float, by: float, bz: float, i: int) -> float:
-    """Component i of h of a bone that is turned by two turns (3,)."""
-    b = bx if i == 0 else (by if i == 1 else bz)
-    one_b = one[0] * bx + one[1] * by + one[2] * bz
-    other_b = other[0] * bx + other[1] * by + other[2] * bz
+def _arc(one: Float, other: Float, bone: Vector) -> Vector:
+    """Return h of a bone that is turned by two turns (3,)."""
+    x, y, z = bone
+    one_b = one[0] * x + one[1] * y + one[2] * z
+    other_b = other[0] * x + other[1] * y + other[2] * z
     both = one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
-    return 0.5 * (one[i] * other_b + other[i] * one_b) - both * b
+    return (
+        0.5 * (one[0] * other_b + other[0] * one_b) - both * x,
+        0.5 * (one[1] * other_b + other[1] * one_b) - both * y,
+        0.5 * (one[2] * other_b + other[2] * one_b) - both * z,
+    )
 
 
 @inner
@@ -346,57 +319,37 @@ def _second_derivatives(
     rig: Rig, T: Float, seen: Bool, k: int, m: int, pair: int, work: Scratch, scratch: CovarianceScratch
 ) -> None:
     """Write second derivatives of joints and markers (not whitened) by k and m."""
-    hand, mounts, w = rig.hand, rig.mounts, scratch.w
-    for joint in range(26):
-        if hand.finger[joint] >= 0:
-            continue
-        bx = by = bz = 0.0
-        for j in range(3):
-            bx += T[0, j] * hand.rest_m[joint, j]
-            by += T[1, j] * hand.rest_m[joint, j]
-            bz += T[2, j] * hand.rest_m[joint, j]
-        for i in range(3):
-            scratch.joint[pair, joint, i] = _second_derivative(w[0, 0, k], w[0, 0, m], bx, by, bz, i)
-    for joint in range(26):
+    hand, mounts, w, P = rig.hand, rig.mounts, scratch.w, work.P
+    palm = T[0, 3], T[1, 3], T[2, 3]
+    for joint in range(26):  # joints of a finger follow each other
         f, level = hand.finger[joint], hand.level[joint]
         if f < 0:
-            continue
-        bx, by, bz = work.P[f, level, 0], work.P[f, level, 1], work.P[f, level, 2]
-        if level > 0:  # joints of a finger follow each other
-            bx, by, bz = (
-                bx - work.P[f, level - 1, 0],
-                by - work.P[f, level - 1, 1],
-                bz - work.P[f, level - 1, 2],
+            x, y, z = vector_at(hand.rest_m, joint, START)
+            rest = (
+                T[0, 0] * x + T[0, 1] * y + T[0, 2] * z,
+                T[1, 0] * x + T[1, 1] * y + T[1, 2] * z,
+                T[2, 0] * x + T[2, 1] * y + T[2, 2] * z,
             )
+            h = _arc(w[0, 0, k], w[0, 0, m], rest)
         else:
-            bx, by, bz = bx - T[0, 3], by - T[1, 3], bz - T[2, 3]
-        for i in range(3):
-            second_derivative = _second_derivative(w[f, level, k], w[f, level, m], bx, by, bz, i)
-            scratch.joint[pair, joint, i] = second_derivative + (
-                scratch.joint[pair, joint - 1, i] if level > 0 else 0.0
-            )
+            before = vector_at(P[f], level - 1, START) if level > 0 else palm
+            h = _arc(w[f, level, k], w[f, level, m], minus(vector_at(P[f], level, START), before))
+            if level > 0:
+                h = plus(h, vector_at(scratch.joint[pair], joint - 1, START))
+        put_vector(scratch.joint[pair], joint, h)
     for marker in range(mounts.finger.shape[0]):
         if not seen[marker]:
             continue
-        f, level = mounts.finger[marker], mounts.level[marker]
-        marker_point(mounts, marker, T, work.R, work.P, work.point)
-        bone = min(level, 2) + 1
-        bx, by, bz = work.point[0] - T[0, 3], work.point[1] - T[1, 3], work.point[2] - T[2, 3]
-        if f >= 0:
-            bx, by, bz = (
-                work.point[0] - work.P[f, level, 0],
-                work.point[1] - work.P[f, level, 1],
-                work.point[2] - work.P[f, level, 2],
-            )
+        f, level = int(mounts.finger[marker]), int(mounts.level[marker])
+        marker_point(mounts, marker, T, work, work.point)
+        point, bone = (work.point[0], work.point[1], work.point[2]), min(level, 2) + 1
+        if f < 0:
+            h = _arc(w[0, 0, k], w[0, 0, m], minus(point, palm))
+        else:
+            h = _arc(w[f, bone, k], w[f, bone, m], minus(point, vector_at(P[f], level, START)))
+            h = plus(vector_at(scratch.joint[pair], CHAINS[f, level], START), h)
         for i in range(3):
-            if f < 0:
-                scratch.marker[pair, 3 * marker + i] = _second_derivative(
-                    w[0, 0, k], w[0, 0, m], bx, by, bz, i
-                )
-            else:
-                carried = scratch.joint[pair, scratch.joint_of[f, level], i]
-                second_derivative = _second_derivative(w[f, bone, k], w[f, bone, m], bx, by, bz, i)
-                scratch.marker[pair, 3 * marker + i] = carried + second_derivative
+            scratch.marker[pair, 3 * marker + i] = h[i]
 
 
 @inner
@@ -432,17 +385,7 @@ def _gain(
     for m in range(mounts.finger.shape[0]):
         if not seen[m]:
             continue
-        f = mounts.finger[m]
-        marker_point(mounts, m, T, work.R, work.P, work.point)
-        for i in range(3):
-            work.arm[i] = work.point[i] - T[i, 3]
-        palm_jacobian(work.arm, scratch.J)
-        size, start = 6, 0
-        if f >= 0:
-            start, size = hand.first[f], 6 + hand.first[f + 1] - hand.first[f]
-            finger_jacobian(
-                hand, work.by, T, work.R, work.P, f, mounts.level[m], work.point, PLACE, scratch.J
-            )
+        size, start = marker_jacobian(hand, mounts, m, T, work, scratch.J)
         _whiten(information[m], scratch.white)
         for i in range(3):
             for c in range(N):
@@ -498,10 +441,20 @@ def _at_most_one(N: int, K: int, scratch: CovarianceScratch) -> None:
             scratch.gain[c, r] = scratch.row[r]
 
 
+@inlined
+def _add_square(out: Float, share: float, x: float, y: float, z: float) -> None:
+    """Add the upper triangle of a vector's square, by a share."""
+    out[0, 0] += share * x * x
+    out[0, 1] += share * x * y
+    out[0, 2] += share * x * z
+    out[1, 1] += share * y * y
+    out[1, 2] += share * y * z
+    out[2, 2] += share * z * z
+
+
 @inner
 def add_second_order(
     rig: Rig,
-    settings: Settings,
     T: Float,
     cov: Float,
     seen: Bool,
@@ -515,7 +468,7 @@ def add_second_order(
     `work` has chains and derivatives of T; `seen` (M,) markers, `information` (M, 3, 3) [1/m^2] of their
     places.
     """
-    count, N = _rotation_columns(settings, cov, scratch), cov.shape[0]
+    count, N = _rotation_columns(rig.settings, cov, scratch), cov.shape[0]
     if count == 0:
         return
     _bone_rotations(rig.hand, T, count, work, scratch)
@@ -539,11 +492,7 @@ def add_second_order(
         pair = 0
         for k in range(count):
             for m in range(k + 1):
-                hx, hy, hz = (
-                    scratch.joint[pair, joint, 0],
-                    scratch.joint[pair, joint, 1],
-                    scratch.joint[pair, joint, 2],
-                )
+                hx, hy, hz = vector_at(scratch.joint[pair], joint, START)
                 for r in range(K):
                     hx -= scratch.BL[0, r] * scratch.marker[pair, r]
                     hy -= scratch.BL[1, r] * scratch.marker[pair, r]
@@ -551,17 +500,7 @@ def add_second_order(
                 share = 0.5 if k == m else 1.0  # those of two turns count twice
                 if k == m:
                     mx, my, mz = mx + hx, my + hy, mz + hz
-                out[0, 0] += share * hx * hx
-                out[0, 1] += share * hx * hy
-                out[0, 2] += share * hx * hz
-                out[1, 1] += share * hy * hy
-                out[1, 2] += share * hy * hz
-                out[2, 2] += share * hz * hz
+                _add_square(out, share, hx, hy, hz)
                 pair += 1
-        out[0, 0] += 0.25 * mx * mx
-        out[0, 1] += 0.25 * mx * my
-        out[0, 2] += 0.25 * mx * mz
-        out[1, 1] += 0.25 * my * my
-        out[1, 2] += 0.25 * my * mz
-        out[2, 2] += 0.25 * mz * mz
+        _add_square(out, 0.25, mx, my, mz)
         out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]

@@ -19,16 +19,25 @@ from common.geometry.camera_model import CameraModel
 from common.hand.model import FINGERS, HandJoints, HandModel
 from common.kernels import bound
 from common.messages import Source, WristDetections
-from common.records import boxed, fields
+from common.records import boxed, fields, record
 from master.estimator.kinematics import Scratch, pose
 from master.estimator.parameters import HandParameters, HandTables, Mounts
 from master.estimator.posterior import Model, Workspace, count_rows
 from master.estimator.priors import CubicLaw, PosturePrior, WristModel
-from master.estimator.problem import Observations, Rig, observe_points, observe_rays
-from master.estimator.sensors import EXTRAS, HEADING, NO_EXTRAS, CameraArrays, Device, observe_wrist
+from master.estimator.problem import Observations, observe_points, observe_rays
+from master.estimator.sensors import (
+    EXTRAS,
+    HEADING,
+    NO_EXTRAS,
+    CameraArrays,
+    Device,
+    WristRows,
+    in_image,
+    observe_wrist,
+)
 from master.estimator.settings import Settings
 from master.estimator.solve import Blank
-from master.estimator.state import HandState, stationary_of
+from master.estimator.state import stationary_of, unknown_hand
 from master.estimator.update import Estimate, fit_epoch, predict_epoch, take_over_epoch
 from master.estimator.wrist_update import prepare_epoch
 from master.rig.wrist import WristSetup
@@ -108,7 +117,7 @@ class Epoch:
     variance_px2: Float | None = None  # (C, A) of each camera's own errors; NaN: not to be used
     own_m2: Float | None = None  # (A, 3, 3) [m^2] of what is wrong with each marker itself, beside bones
     orientation: "OrientationMeasurement | None" = None  # of the palm by other sensors; None: not measured
-    wrist: "WristRows | None" = None  # what a wrist device sees of the fingers; None: nothing
+    wrist: WristRows | None = None  # what a wrist device sees of the fingers; None: nothing
     place: Float | None = None  # (3,) [m] where the palm is, of a wrist device alone; None: not known
     start: SolvedHand | None = None  # another hand of this epoch; None: there is none
     second_order: bool = True  # whether the joints' covariance is wanted to second order
@@ -123,21 +132,6 @@ class OrientationMeasurement:
     sure: bool  # whether it is known about every axis how the palm lies
     axes: Float | None = None  # (3, 3) rows, rig axes: of tilt 2 and heading; None: IMU on the palm
     process_noise_rad2: float = 0.0  # variance of what the heading has drifted since the epoch before
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class WristRows:
-    """Measurements of five fingers from one strobe cycle; rays are (x, y, 1)."""
-
-    laser: Float  # (5, 2) x, y, as `tip`; NaN: not seen
-    laser_sigma_px: Float  # (5,) standard deviation per axis, as `tip_sigma_px`
-    laser_px: Float  # (5,) lengths of the lines
-    tip: Float
-    tip_sigma_px: Float
-    tip_depth: Float  # (5,) distances of the tips by light, in a unit of its own
-    laser_s: float  # how much later than the epoch the laser points were seen, as `tip_s` the fingertips
-    tip_s: float
-    law: Float  # (5,) PIPs [rad] by another law of the laser point; NaN: none
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,35 +196,33 @@ class EpochSteps:
         self._settings, mounts, count = settings, Mounts.of(model, hand_markers), len(hand_markers)
         self.on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
         self.finger = mounts.finger
-        extras, device = (NO_EXTRAS, Device.none()) if wrist is None else (EXTRAS, wrist.device)
-        self._rig = Rig(HandTables.of(model, parameters), mounts, CameraArrays.of(cameras), device)
-        n = len(parameters.free)
+        extras, device = (NO_EXTRAS, record(Device)) if wrist is None else (EXTRAS, wrist.device)
+        self._cameras, n = CameraArrays.of(cameras), len(parameters.free)
         self.observed = observed = Observations.empty(len(cameras), count)
         self.triangulated: Bool = np.zeros(count, np.bool_)
         self._blank = Blank.of(n, extras, len(cameras), count)
         # Records are used by their fields here, and handed to kernels in the arrays that they lie in.
-        self.state = state = HandState.unknown(n, extras)
-        space = Workspace.empty(n, extras, _capacity(count))
-        self.now, self.at = fields(state), fields(space)
-        self._state, self._space, self._work = boxed(state), boxed(space), boxed(Scratch.empty())
+        sizes = {"n": n, "K": extras, "N": 6 + n + extras}
+        self.state = unknown_hand(**sizes)
+        space = record(Workspace, **sizes, M=_capacity(count))
+        self.now, self.at = fields(self.state), fields(space)
+        self._state, self._space, self._work = boxed(self.state), boxed(space), boxed(record(Scratch))
         self._ground = self._space["ground"]
         self._lines_of_sight = self._space["epoch_prior"]["lines_of_sight"]
-        hand, device = boxed(self._rig.hand), boxed(device)
-        self._model = Model(hand, boxed(settings.record()), mounts, self._rig.cameras, device)
+        hand, device = boxed(HandTables.of(model, parameters)), boxed(device)
+        self._model = Model(hand, boxed(settings.record()), mounts, self._cameras, device)
         self.at.scratch.search.wrist_share[0] = settings.wrist_share
         self.at.epoch_prior.z_info[0, 0] = 1.0  # of a rig without wrist device: one extra that means nothing
         if wrist is not None:
             self._lay_out(wrist)
         nothing, own = np.full((len(cameras), len(markers), 2), np.nan), np.zeros((len(markers), 3, 3))
         scratch = np.empty((26, 3)), np.empty((26, 3, 3)), np.empty((count, 3))
-        none = np.full((5, 2), np.nan)
-        each = none[:, 0].copy()
+        none, each = np.full((5, 2), np.nan), np.full(5, np.nan)
+        rows = WristRows(none, each, each, none, each, each, 0.0, 0.0, each)
         self._rays = bound(observe_rays, nothing, nothing[..., 0].copy(), own, self.on_hand, observed)
         self._points = bound(observe_points, scratch[2], own[self.on_hand], 0.0, observed)
         self._count = bound(count_rows, mounts, observed, self._ground)
-        self._cycle = bound(
-            observe_wrist, device, none, each, each, none, each, each, 0.0, 0.0, 0.0, self._lines_of_sight
-        )
+        self._cycle = bound(observe_wrist, device, rows, 0.0, self._lines_of_sight)
         self._pose = bound(pose, hand, mounts, _AT_ORIGIN, np.zeros(20), self._work, *scratch)
         rig, state, space = self._model, self._state, self._space
         self._prepare = bound(prepare_epoch, rig, state, space)
@@ -242,10 +234,8 @@ class EpochSteps:
         """Place joints and markers (M, 3) [m], rig frame, as `Estimator.pose`."""
         position, rotation = np.empty((26, 3)), np.empty((26, 3, 3))
         places, angles = np.empty((len(self.on_hand), 3)), angles_rad.reshape(20)
-        T_whole = np.ascontiguousarray(T)
-        self._pose(
-            self._model.hand, self._model.mounts, T_whole, angles, self._work, position, rotation, places
-        )
+        model, at = self._model, np.ascontiguousarray(T)
+        self._pose(model.hand, model.mounts, at, angles, self._work, position, rotation, places)
         return HandJoints(position, rotation, T), places
 
     def observe(self, at: Epoch, *, continuous: bool) -> None:
@@ -258,29 +248,20 @@ class EpochSteps:
             lines_of_sight.lit[:] = lines_of_sight.shown[:] = 0.0
         else:
             self.at.prior.law[:] = at.wrist.law
-            seen = at.wrist
-            laser = seen.laser, seen.laser_sigma_px, seen.laser_px
-            tip = seen.tip, seen.tip_sigma_px, seen.tip_depth
-            times = seen.laser_s, seen.tip_s
-            light_rad = self._settings.light_rad
-            self._cycle(self._model.device, *laser, *tip, light_rad, *times, self._lines_of_sight)
-        if at.uv is None and at.cov_m2 is None:
-            self.observed.seen[:] = False
-        elif at.cov_m2 is not None:
-            bones_m2 = self._settings.bones_m**2
+            self._cycle(self._model.device, at.wrist, self._settings.light_rad, self._lines_of_sight)
+        bones_m2 = self._settings.bones_m**2
+        if at.cov_m2 is not None:
             points, cov = at.points_m[self.on_hand], at.cov_m2[self.on_hand]
             self._points(points, cov, bones_m2, self.observed)
+            self.triangulated = self.observed.triangulated
         else:
-            assert at.uv is not None
-            assert at.variance_px2 is not None
-            assert at.own_m2 is not None
-            own = at.own_m2 + self._settings.bones_m**2 * _EYE
-            uv, variance = np.ascontiguousarray(at.uv), np.ascontiguousarray(at.variance_px2)
-            self._rays(uv, variance, own, self.on_hand, self.observed)
-        measured = at.cov_m2 is not None
-        self.triangulated = (
-            self.observed.triangulated if measured else np.isfinite(at.points_m[self.on_hand].sum(axis=1))
-        )
+            self.triangulated = np.isfinite(at.points_m[self.on_hand].sum(axis=1))
+            self.observed.seen[:] = False
+            if at.uv is not None:
+                assert at.variance_px2 is not None
+                assert at.own_m2 is not None
+                uv, variance = np.ascontiguousarray(at.uv), np.ascontiguousarray(at.variance_px2)
+                self._rays(uv, variance, at.own_m2 + bones_m2 * _EYE, self.on_hand, self.observed)
         self._count(self._model.mounts, self.observed, self._ground)
 
     def prepare(self) -> None:
@@ -294,7 +275,7 @@ class EpochSteps:
         epoch_prior.back_normal_w2[0] = self._settings.back_normal_rad**-2.0 if ground.back[0] else 0.0
         epoch_prior.depth_w2[0] = 0.0
         if known and ground.most[0] == 1:
-            camera_centre = self._rig.cameras.centre[(self.observed.weight > 0.0).sum(axis=1).argmax()]
+            camera_centre = self._cameras.centre[(self.observed.weight > 0.0).sum(axis=1).argmax()]
             line_of_sight = self.now.palm[:3, 3] - camera_centre
             epoch_prior.line_of_sight[:] = line_of_sight / np.sqrt(line_of_sight @ line_of_sight)
             epoch_prior.depth_w2[0] = self._settings.held_depth_m**-2.0
@@ -386,14 +367,17 @@ def _capacity(markers: int) -> int:
     return max(-(-markers // step), 1) * step
 
 
-_NO_LAW = np.full(5, nan)
+def count_fingers(counts: Counter[str], event: str, fingers: Bool) -> None:
+    """Count an event of some fingers (5,)."""
+    counts.update(f"{event}.{FINGERS[f]}" for f in np.flatnonzero(fingers))
 
 
 class CycleReader:
     """Converts cycles to rows; counts by finger `outside`, `tip_outside`, `no_plane`."""
 
-    def __init__(self, setup: WristSetup, cubic: CubicLaw | None, counts: Counter[str]) -> None:
-        self._setup, self._cubic, self._counts = setup, cubic, counts
+    def __init__(self, setup: WristSetup, counts: Counter[str]) -> None:
+        self._setup, self._counts = setup, counts
+        self._cubic = CubicLaw(setup) if setup.cubic else None
 
     def read(self, message: WristDetections, t_ns: int) -> tuple[WristRows, Float]:
         """Return a strobe cycle's rows, laser points (5, 3) [m], camera frame; NaN: none."""
@@ -404,10 +388,9 @@ class CycleReader:
         xy1 = np.ones((10, 3))
         xy1[:, :2] = setup.optics.undistort(uv)
         away = setup.offset_m / (xy1[:5] @ setup.normal)
-        for f, (u, far) in enumerate(zip(uv[:5, 0].tolist(), away.tolist(), strict=True)):
-            if u == u and not far > 0.0:  # NaN was not seen
-                away[f] = nan
-                self._counts[f"no_plane.{FINGERS[f]}"] += 1
+        no_plane = np.isfinite(uv[:5, 0]) & ~(away > 0.0)
+        away[no_plane] = nan
+        count_fingers(self._counts, "no_plane", no_plane)
         points_m = xy1[:5] * away[:, None]
         laser, tip = xy1[:5, :2].copy(), xy1[5:, :2].copy()
         if solver_mode == "fk":
@@ -415,7 +398,9 @@ class CycleReader:
         elif solver_mode == "ik":
             alone = ~(np.isfinite(laser[:, 0]) & np.isfinite(tip[:, 0]))
             laser[alone], tip[alone] = nan, nan
-        law = _NO_LAW if self._cubic is None else np.where(np.isnan(tip[:, 0]), self._cubic(points_m), nan)
+        law = np.full(5, nan)
+        if self._cubic is not None:
+            law = np.where(np.isnan(tip[:, 0]), self._cubic(points_m), nan)
         late_s = 1e-9 * (message.t_ns + setup.late_ns - t_ns)
         tips = tip, message.tip_sigma_px, message.tip_depth
         times = late_s, late_s + setup.frame_s
@@ -423,11 +408,6 @@ class CycleReader:
 
     def _reject(self, event: str, uv: Float, sigma_px: Float) -> None:
         """Write NaN to points (5, 2) outside the picture or anywhere in it; count."""
-        optics = self._setup.optics
-        right, low = optics.width_px - 0.5, optics.height_px - 0.5
-        most_px = max(optics.width_px, optics.height_px)
-        for f, ((u, v), sigma) in enumerate(zip(uv.tolist(), sigma_px.tolist(), strict=True)):
-            inside = -0.5 <= u <= right and -0.5 <= v <= low and sigma <= most_px
-            if u == u and not inside:
-                uv[f] = nan
-                self._counts[f"{event}.{FINGERS[f]}"] += 1
+        outside = np.isfinite(uv[:, 0]) & ~in_image(self._setup, uv, sigma_px)
+        uv[outside] = nan
+        count_fingers(self._counts, event, outside)

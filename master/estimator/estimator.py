@@ -5,8 +5,9 @@ markers; else from several, open to closed, each laid on the markers as a rigid 
 on.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -33,24 +34,6 @@ _AT_ORIGIN = np.eye(4)
 NONE = frozenset[int]()
 
 
-class PosturePriorTables:
-    """Posture priors of one hand by fingers flexed unlike the others, cached."""
-
-    def __init__(
-        self, model: HandModel, parameters: HandParameters, settings: Settings, *, natural: bool
-    ) -> None:
-        """Of a hand; `natural`: it is taken to obey them."""
-        self._model, self._parameters, self._settings, self._natural = model, parameters, settings, natural
-        self._tables: dict[frozenset[int], PosturePrior] = {}
-
-    def unlike(self, fingers: frozenset[int]) -> PosturePrior:
-        """Those while these fingers are bent unlike the others."""
-        if fingers not in self._tables:
-            posture_prior = posture_prior_of(self._model, self._parameters, self._settings, fingers)
-            self._tables[fingers] = posture_prior.natural_component() if self._natural else posture_prior
-        return self._tables[fingers]
-
-
 class Reinitialiser:
     """Fits without the state. What it holds was prepared by the constructor."""
 
@@ -58,9 +41,10 @@ class Reinitialiser:
         self,
         steps: EpochSteps,
         parameters: HandParameters,
-        posture_prior: PosturePriorTables,
+        posture_prior: Callable[[frozenset[int]], PosturePrior],
         settings: Settings,
     ) -> None:
+        """Prepare; `posture_prior` gives that of a hand with fingers unlike the others."""
         self._steps, self._parameters = steps, parameters
         self._posture_prior, self._settings = posture_prior, settings
         postures = np.zeros((len(_BENDS_RAD), 5, 4))
@@ -68,7 +52,7 @@ class Reinitialiser:
         postures[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (mcp_per_pip, 1.0))[:, None]
         self._postures = np.array([parameters.of_angles(angles) for angles in postures])
         self._finger_of_free = parameters.free // 4
-        any_finger = posture_prior.unlike(NONE)
+        any_finger = posture_prior(NONE)
         likeliest = np.asarray(np.linalg.solve(any_finger.normal[0], any_finger.pull[0]), np.float64)
         self._natural = np.minimum(np.maximum(likeliest, parameters.low), parameters.high)
 
@@ -88,31 +72,31 @@ class Reinitialiser:
     def _begin_with(self, at: Epoch, shown: frozenset[int], like: frozenset[int]) -> float:
         """As `begin`, while the hidden fingers of `like` are bent as their neighbours."""
         steps, outliers, start = self._steps, frozenset(range(5)) - shown - like, at.start
-        task, epoch_prior, scratch = steps.at.task, steps.at.epoch_prior, steps.at.scratch
+        task, epoch_prior, begin = steps.at.task, steps.at.epoch_prior, steps.at.scratch.start
         epoch_prior.past_w2[:] = epoch_prior.past[:] = 0.0
         epoch_prior.palm_w2[:] = epoch_prior.depth_w2[:] = 0.0
         fingers = np.isin(np.arange(5), list(outliers))
         epoch_prior.own_w2[:], epoch_prior.own[:] = curled(self._parameters, self._settings, fingers)
         even = 0.5  # probability
         task.natural_weight[0], task.counts[0] = even, 0.0
-        posture_prior = self._posture_prior.unlike(outliers)
+        posture_prior = self._posture_prior(outliers)
         try:
             if start is not None:
                 shows = steps.at.ground.shown[self._finger_of_free] > 0
                 x = np.where(shows, self._parameters.of_angles(start.angles_rad), self._natural)
-                scratch.start_T[:], scratch.start_x[:] = start.T_rig_palm, self._with_scanned(x)
+                begin.palm[:], begin.x[:] = start.T_rig_palm, self._with_scanned(x)
                 chi2 = steps.fit(posture_prior)
                 if steps.at.found.steps[0] < MAX_ITERATIONS and not steps.has_outlier():
                     return chi2
             ends = list[tuple[float, Float, Float]]()
             starts = self._starts(at)
             if len(starts) == 1:
-                scratch.start_T[:], scratch.start_x[:] = starts[0]
+                begin.palm[:], begin.x[:] = starts[0]
                 return steps.fit(posture_prior)
             for T, x in starts:
-                task.palm[:], task.x[:] = T, x
-                ends.append((steps.fit(posture_prior, coarse=True), task.palm.copy(), task.x.copy()))
-            _, scratch.start_T[:], scratch.start_x[:] = min(ends, key=lambda end: end[0])
+                begin.palm[:], begin.x[:] = T, x
+                ends.append((steps.fit(posture_prior, coarse=True), begin.palm.copy(), begin.x.copy()))
+            _, begin.palm[:], begin.x[:] = min(ends, key=lambda end: end[0])
             return steps.fit(posture_prior)
         finally:
             epoch_prior.own_w2[:] = 0.0
@@ -198,8 +182,13 @@ class Estimator:
         self.model, self.settings, self.wrist = model, settings, wrist is not None
         self._continuous, self._natural_only = continuous, natural
         self.parameters = HandParameters.of(model)
-        posture_prior = PosturePriorTables(model, self.parameters, settings, natural=natural)
-        self._posture_prior = posture_prior.unlike(NONE)
+
+        @cache
+        def posture_prior(unlike: frozenset[int]) -> PosturePrior:
+            prior = posture_prior_of(model, self.parameters, settings, unlike)
+            return prior.natural_component() if natural else prior
+
+        self._posture_prior = posture_prior(NONE)
         self._natural_prior = self._posture_prior.natural_component()
         self._steps = EpochSteps(
             cameras, model, self.parameters, markers, hand_markers, self._posture_prior, settings, wrist
@@ -234,10 +223,9 @@ class Estimator:
 
     def forget_heading(self) -> None:
         """Let the heading of an IMU be any, and what was learnt with it."""
-        self._now.z_cov[WRIST_ANGLES:LED_SCALE] = self._now.z_cov[:, WRIST_ANGLES:LED_SCALE] = 0.0
-        self._now.z_cov[range(WRIST_ANGLES, LED_SCALE), range(WRIST_ANGLES, LED_SCALE)] = (
-            self._now.stationary[WRIST_ANGLES:LED_SCALE]
-        )
+        cov, learnt = self._now.z_cov, np.arange(WRIST_ANGLES, LED_SCALE)
+        cov[learnt] = cov[:, learnt] = 0.0
+        cov[learnt, learnt] = self._now.stationary[learnt]
 
     def begin_heading(self, heading_rad: float, variance_rad2: float) -> None:
         """Take the heading of an IMU from a palm that was solved without it."""
@@ -277,11 +265,10 @@ class Estimator:
         if ground.seen[0] > 0 or (by_device and (at.place is not None or self._knows_place())):
             self._now.seen_ns[0] = at.t_ns
         sources = self._sources(at, palm_shown=palm_shown)
-        return (
-            _unknown(sources)
-            if out is None
-            else self._fitted(at, out, sources, reinitialised=reinitialised, rejected=rejected)
-        )
+        if out is None:
+            none = np.zeros((2, 26), np.bool_)
+            return Fitted(None, none[0], none[1], np.zeros(26, np.uint8), sources)
+        return self._fitted(at, out, sources, reinitialised=reinitialised, rejected=rejected)
 
     def _solve(self, at: Epoch, *, known: bool) -> tuple[Estimate | None, bool]:
         """Fit an epoch and take it over; return the hand, and if it began anew."""
@@ -372,11 +359,6 @@ class Estimator:
             refused=task.refused.astype(np.bool_),
             off=task.off.astype(np.bool_),
         )
-
-
-def _unknown(sources: Int) -> Fitted:
-    none = np.zeros(26, np.bool_)
-    return Fitted(None, none, none.copy(), np.zeros(26, np.uint8), sources, False)
 
 
 def pose_of(

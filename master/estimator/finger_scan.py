@@ -17,19 +17,20 @@ several parts the heaviest, by where the finger was, is taken, and the covarianc
 """
 
 from math import exp, inf, isfinite, log, pi, sqrt
-from typing import Any
 
 from common.arrays import Float, Int
 from common.kernels import inlined, inner
-from common.records import record
+from common.records import array, part
 from master.estimator.finger_surface import NO_MOVES, OWN_MOVES, Surface, first_hit, laser_centroid, look
 from master.estimator.kinematics import twist_hand
 from master.estimator.parameters import HandTables
+from master.estimator.problem import Rig
 from master.estimator.sensors import LinesOfSight
 from master.estimator.settings import Settings
 from master.fabrik.linear_algebra import cholesky, substitute
 
 NODES, FINE = 16, 4
+_PLACES = FINE * (NODES - 1) + 1  # of a density, in fine steps
 ROWS = 8  # laser 2, tip 2, depth, abduction, DIP, twist
 HANDS = 3
 _COARSE_RAD = (0.15, 0.6, 1.05, 1.4)  # flexions that are tried
@@ -38,114 +39,66 @@ _COARSE_RAD = (0.15, 0.6, 1.05, 1.4)  # flexions that are tried
 class Prior:
     """Prior of the fingers before a strobe cycle is seen."""
 
-    palm: Float  # (4, 4) camera frame
-    wrist_axes: Float  # (2, 3) as of `flexed_palm`
-    twist: Float  # (5,) mean of the twist of the hinges [rad], and `twist2` its variance
-    twist2: Float
-    light: Float  # (1,) mean of the logarithm of the light's unit, and `light2` its variance
-    light2: Float
-    base_rad: Float  # (5, 4) natural angles by the PIP: base_rad + per_pip PIP
-    per_pip: Float
-    abduction: Float  # (5,) standard deviations [rad] of abduction, and `flexion` of flexion, about them
-    flexion: Float
-    coupled_share: Float  # (1,) by how much of the PIP more this hand bends in its MCP (`wrist_update`),
-    coupled_spread: Float  # (1,) and within how much of it
-    last: Float  # (5,) PIPs expected [rad],
-    process_noise: Float  # (5,) how far from there they may be,
-    had_previous: Float  # (5,) and whether they are expected anywhere
-    near_rad: Float  # (5,) how far from there a finger that is well known is searched; 0: everywhere
-    natural_only: Float  # (1,) 1 where fingers are taken to bend naturally, whatever is seen (level "fk")
-    law: Float  # (5,) PIPs by another law [rad]; NaN: none
-    frame: Float  # (4,) least and most x and y of a fingertip that is clearly in the image
-
-    @classmethod
-    def empty(cls) -> "Prior":
-        """Allocate it."""
-        return record(
-            cls,
-            **dict.fromkeys(
-                (
-                    "twist",
-                    "twist2",
-                    "abduction",
-                    "flexion",
-                    "last",
-                    "process_noise",
-                    "had_previous",
-                    "near_rad",
-                    "law",
-                ),
-                5,
-            ),
-            **dict.fromkeys(("light", "light2", "coupled_share", "coupled_spread", "natural_only"), 1),
-            palm=(4, 4),
-            wrist_axes=(2, 3),
-            base_rad=(5, 4),
-            per_pip=(5, 4),
-            frame=4,
-        )
+    palm: Float = array(4, 4)  # camera frame
+    wrist_axes: Float = array(2, 3)  # as of `flexed_palm`
+    twist: Float = array(5)  # mean of the twist of the hinges [rad], and `twist2` its variance
+    twist2: Float = array(5)
+    light: Float = array(1)  # mean of the logarithm of the light's unit, and `light2` its variance
+    light2: Float = array(1)
+    base_rad: Float = array(5, 4)  # natural angles by the PIP: base_rad + per_pip PIP
+    per_pip: Float = array(5, 4)
+    abduction: Float = array(
+        5
+    )  # standard deviations [rad] of abduction, and `flexion` of flexion, about them
+    flexion: Float = array(5)
+    coupled_share: Float = array(
+        1
+    )  # by how much of the PIP more this hand bends in its MCP (`wrist_update`),
+    coupled_spread: Float = array(1)  # and within how much of it
+    last: Float = array(5)  # PIPs expected [rad],
+    process_noise: Float = array(5)  # how far from there they may be,
+    had_previous: Float = array(5)  # and whether they are expected anywhere
+    near_rad: Float = array(5)  # how far from there a finger that is well known is searched; 0: everywhere
+    natural_only: Float = array(
+        1
+    )  # 1 where fingers are taken to bend naturally, whatever is seen (level "fk")
+    law: Float = array(5)  # PIPs by another law [rad]; NaN: none
+    frame: Float = array(4)  # least and most x and y of a fingertip that is clearly in the image
 
 
 class Scan:
     """Estimates of five fingers along their minima, for every PIP."""
 
-    x: Float  # (5, NODES, 5) angles and twist [rad] at each PIP
-    rows: Float  # (5, NODES, 8) residuals in their standard deviations
-    volume: Float  # (5, NODES) logarithm of |S|^1/2
-    flexion2: Float  # (5, NODES) variance of the flexion
-    length_px: Float  # (5, NODES) of the laser's line
-    lack: Float  # (5, NODES, 2) of the ridge to the cut
-    hand: Float  # (5, 3) logarithm of the evidence of each hand
-    share: Float  # (3,) probabilities of the hands
-    p: Float  # (61,) density of one finger
-    near: Float  # (61,) that by which its place is chosen
-    log_p: Float  # (5, 3, 61) logarithm of the density of each finger, fine, by hand
-    out: Float  # (5, 5) angles and twist chosen
-    mode: Float  # (5, 5) of the most likely pose of that part
-    way: Float  # (5, 5) derivative of these by the PIP there
-    pip2: Float  # (5,) variance of the PIP
-    chi2: Float  # (5,) of the best node; of none: infinite
-    parts: Float  # (5,) how many parts a density has that count
-    known: Float  # (5,) whether the finger was scanned
-    first: Int  # (5,) node where the search of the minimum began, and `last` where it ended
-    last: Int
-    showing: Float  # (5, NODES) 1 where the fingertip would be in sight
-    angles: Float  # (20,)
-    H: Float  # (4, 4)
-    L: Float  # (4, 4)
-    g: Float  # (4,)
-    S: Float  # (4, 4)
-    J: Float  # (8, 4)
-    r: Float  # (8,)
-    twist: Float  # (5,)
-    surface: Surface
-
-    @classmethod
-    def empty(cls) -> "Scan":
-        """Allocate it."""
-        fine = FINE * (NODES - 1) + 1
-        return record(
-            cls,
-            **dict.fromkeys(("volume", "flexion2", "length_px", "showing"), (5, NODES)),
-            **dict.fromkeys(("out", "mode", "way"), (5, 5)),
-            **dict.fromkeys(("pip2", "chi2", "parts", "known", "twist"), 5),
-            **dict.fromkeys(("H", "L", "S"), (4, 4)),
-            x=(5, NODES, 5),
-            rows=(5, NODES, ROWS),
-            lack=(5, NODES, 2),
-            hand=(5, HANDS),
-            share=HANDS,
-            p=fine,
-            near=fine,
-            log_p=(5, HANDS, fine),
-            first=("i8", 5),
-            last=("i8", 5),
-            angles=20,
-            g=4,
-            J=(8, 4),
-            r=8,
-            surface=Surface.empty(),
-        )
+    x: Float = array(5, NODES, 5)  # angles and twist [rad] at each PIP
+    rows: Float = array(5, NODES, ROWS)  # residuals in their standard deviations
+    volume: Float = array(5, NODES)  # logarithm of |S|^1/2
+    flexion2: Float = array(5, NODES)  # variance of the flexion
+    length_px: Float = array(5, NODES)  # of the laser's line
+    lack: Float = array(5, NODES, 2)  # of the ridge to the cut
+    hand: Float = array(5, HANDS)  # logarithm of the evidence of each hand
+    share: Float = array(HANDS)  # probabilities of the hands
+    p: Float = array(_PLACES)  # density of one finger
+    near: Float = array(_PLACES)  # that by which its place is chosen
+    log_p: Float = array(5, HANDS, _PLACES)  # logarithm of the density of each finger, fine, by hand
+    out: Float = array(5, 5)  # angles and twist chosen
+    mode: Float = array(5, 5)  # of the most likely pose of that part
+    way: Float = array(5, 5)  # derivative of these by the PIP there
+    pip2: Float = array(5)  # variance of the PIP
+    chi2: Float = array(5)  # of the best node; of none: infinite
+    parts: Float = array(5)  # how many parts a density has that count
+    known: Float = array(5)  # whether the finger was scanned
+    first: Int = array(5, kind="i8")  # node where the search of the minimum began, and `last` where it ended
+    last: Int = array(5, kind="i8")
+    showing: Float = array(5, NODES)  # 1 where the fingertip would be in sight
+    angles: Float = array(20)
+    H: Float = array(4, 4)
+    L: Float = array(4, 4)
+    g: Float = array(4)
+    S: Float = array(4, 4)
+    J: Float = array(8, 4)
+    r: Float = array(8)
+    twist: Float = array(5)
+    surface: Surface = part(Surface)
 
 
 @inlined
@@ -163,32 +116,30 @@ def _dip_sigma(settings: Settings, f: int, pip: float) -> float:
 
 
 @inner
-def _rows(
-    settings: Settings, lines_of_sight: LinesOfSight, prior: Prior, f: int, tip: bool, scan: Scan
-) -> float:
+def _rows(rig: Rig, lines: LinesOfSight, prior: Prior, f: int, scan: Scan) -> float:
     """Write residuals (8,), derivatives (8, 4) by `look`; return half chi square."""
     seen, G, r, J, a = scan.surface.seen, scan.surface.J, scan.r, scan.J, scan.angles
     for i in range(ROWS):
         r[i] = 0.0
         for u in range(4):
             J[i, u] = 0.0
-    W = lines_of_sight.laser_W[f]
+    W = lines.laser_W[f]
     p = sqrt(W[0, 0])
     q = W[1, 0] / p
     d = sqrt(max(W[1, 1] - q * q, 0.0))
-    r0 = seen[0] + lines_of_sight.lack[f, 0] - lines_of_sight.laser[f, 0]
-    r1 = seen[1] + lines_of_sight.lack[f, 1] - lines_of_sight.laser[f, 1]
+    r0 = seen[0] + lines.lack[f, 0] - lines.laser[f, 0]
+    r1 = seen[1] + lines.lack[f, 1] - lines.laser[f, 1]
     r[0], r[1] = p * r0 + q * r1, d * r1
     for u in range(4):
         c = _column(u)
         J[0, u], J[1, u] = p * G[0, c] + q * G[1, c], d * G[1, c]
-    if tip:
-        p = sqrt(lines_of_sight.tip_W[f, 0, 0])
-        r[2], r[3] = p * (seen[2] - lines_of_sight.tip[f, 0]), p * (seen[3] - lines_of_sight.tip[f, 1])
-        w = lines_of_sight.depth_w2[f]
+    if lines.shown[f] > 0.0:
+        p = sqrt(lines.tip_W[f, 0, 0])
+        r[2], r[3] = p * (seen[2] - lines.tip[f, 0]), p * (seen[3] - lines.tip[f, 1])
+        w = lines.depth_w2[f]
         if w > 0.0 and prior.light2[0] < 1.0:
             w = sqrt(1.0 / (1.0 / w + prior.light2[0]))
-            r[4] = w * (seen[4] + prior.light[0] - lines_of_sight.depth[f])
+            r[4] = w * (seen[4] + prior.light[0] - lines.depth[f])
         else:
             w = 0.0
         for u in range(4):
@@ -197,7 +148,7 @@ def _rows(
     pip = a[4 * f + 2]
     r[5] = (a[4 * f] - prior.base_rad[f, 0] - prior.per_pip[f, 0] * pip) / prior.abduction[f]
     J[5, 0] = 1.0 / prior.abduction[f]
-    sigma = _dip_sigma(settings, f, pip)
+    sigma = _dip_sigma(rig.settings, f, pip)
     r[6] = (a[4 * f + 3] - prior.base_rad[f, 3] - prior.per_pip[f, 3] * pip) / sigma
     J[6, 2] = 1.0 / sigma
     r[7] = (scan.twist[f] - prior.twist[f]) / sqrt(prior.twist2[f])
@@ -209,7 +160,7 @@ def _rows(
 
 
 @inner
-def _normal(scan: Scan) -> bool:
+def _factor(scan: Scan) -> bool:
     """Factor the normal matrix (4, 4) of the rows; write the gradient."""
     for u in range(4):
         scan.g[u] = 0.0
@@ -235,115 +186,116 @@ def _put(hand: HandTables, f: int, x0: float, x1: float, x3: float, twist: float
     twist_hand(hand, scan.twist)
 
 
+@inlined
+def _look(rig: Rig, prior: Prior, f: int, moves: int, scan: Scan) -> None:
+    look(rig.hand, rig.device, prior.palm, prior.wrist_axes, scan.angles, f, moves, scan.surface)
+
+
 @inner
-def scan_finger(
-    hand: HandTables,
-    device: Any,
-    settings: Settings,
-    lines_of_sight: LinesOfSight,
-    prior: Prior,
-    f: int,
-    tip: bool,
-    scan: Scan,
-) -> None:
+def scan_finger(rig: Rig, lines: LinesOfSight, prior: Prior, f: int, scan: Scan) -> None:
     """Write the minimum of finger f along its PIPs, from `Scan.x` to `chi2`."""
-    a, x, surface = scan.angles, scan.x, scan.surface
-    low, high = hand.limits[f, 2, 0], hand.limits[f, 2, 1]
+    low, high = rig.hand.limits[f, 2, 0], rig.hand.limits[f, 2, 1]
     scan.chi2[f] = inf
-    scan.first[f], scan.last[f] = 0, NODES - 1
+    first, last = 0, NODES - 1
     if prior.near_rad[f] > 0.0:
         step = (high - low) / (NODES - 1)
-        scan.first[f] = min(max(int((prior.last[f] - prior.near_rad[f] - low) / step), 0), NODES - 3)
-        scan.last[f] = min(
-            max(int((prior.last[f] + prior.near_rad[f] - low) / step) + 1, scan.first[f] + 2), NODES - 1
-        )
-    for node in range(scan.first[f], scan.last[f] + 1):
-        pip = low + (high - low) * node / (NODES - 1)
-        a[4 * f + 2] = pip
-        lines_of_sight.lack[f, 0] = lines_of_sight.lack[f, 1] = 0.0
-        dip, aside = (
-            prior.base_rad[f, 3] + prior.per_pip[f, 3] * pip,
-            prior.base_rad[f, 0] + prior.per_pip[f, 0] * pip,
-        )
-        coarse = 4
-        best, at = inf, coarse
-        restart = 5  # every so many nodes others are tried
-        if (node - scan.first[f]) % restart == 0:
-            for start in range(coarse):
-                _put(hand, f, aside, _COARSE_RAD[start], dip, prior.twist[f], scan)
-                look(hand, device, prior.palm, prior.wrist_axes, a, f, NO_MOVES, surface)
-                cost = _rows(settings, lines_of_sight, prior, f, tip, scan)
-                if cost < best:
-                    best, at = cost, start
-        if node > scan.first[f]:
-            before = x[f, node - 1]
-            _put(hand, f, before[0], before[1], before[3], before[4], scan)
-            if at < coarse:
-                look(hand, device, prior.palm, prior.wrist_axes, a, f, NO_MOVES, surface)
-                if _rows(settings, lines_of_sight, prior, f, tip, scan) < best:
-                    at = coarse
-        if at < coarse:
-            _put(hand, f, aside, _COARSE_RAD[at], dip, prior.twist[f], scan)
-        # from the pose of the PIP before, and from one that was tried
-        steps_restart = 5
-        steps = 3 if at == coarse else steps_restart
-        length = cost = 0.0
-        for k in range(steps + 1):
-            look(hand, device, prior.palm, prior.wrist_axes, a, f, OWN_MOVES, surface)
-            if k == steps - 1:
-                length = laser_centroid(device, f, surface)
-                if length > 0.0:
-                    lines_of_sight.lack[f, 0] = (
-                        surface.laser_centroid[0] / surface.laser_centroid[2] - surface.seen[0]
-                    )
-                    lines_of_sight.lack[f, 1] = (
-                        surface.laser_centroid[1] / surface.laser_centroid[2] - surface.seen[1]
-                    )
-            cost = _rows(settings, lines_of_sight, prior, f, tip, scan)
-            if not _normal(scan) or k == steps:
-                break
-            for u in range(4):
-                scan.S[0, u] = -scan.g[u]
-            substitute(scan.L, 4, scan.S[0])
-            for u in range(4):
-                farthest_rad = 0.3  # of one step
-                scan.S[0, u] = min(max(scan.S[0, u], -farthest_rad), farthest_rad)
-            _put(
-                hand,
-                f,
-                a[4 * f] + scan.S[0, 0],
-                a[4 * f + 1] + scan.S[0, 1],
-                a[4 * f + 3] + scan.S[0, 2],
-                scan.twist[f] + scan.S[0, 3],
-                scan,
-            )
-        for k in range(4):
-            x[f, node, k] = a[4 * f + k]
-        x[f, node, 4] = scan.twist[f]
-        volume = 0.0
-        for u in range(4):
-            volume -= log(scan.L[u, u])
-        sigma = _dip_sigma(settings, f, pip)
-        scan.volume[f, node] = volume - log(sigma)
-        for u in range(4):
-            scan.S[0, u] = 1.0 if u == 1 else 0.0
-        substitute(scan.L, 4, scan.S[0])
-        scan.flexion2[f, node] = scan.S[0, 1]
-        scan.length_px[f, node] = length
-        scan.lack[f, node, 0], scan.lack[f, node, 1] = lines_of_sight.lack[f, 0], lines_of_sight.lack[f, 1]
-        for i in range(ROWS):
-            scan.rows[f, node, i] = scan.r[i]
+        first = min(max(int((prior.last[f] - prior.near_rad[f] - low) / step), 0), NODES - 3)
+        last = max(int((prior.last[f] + prior.near_rad[f] - low) / step) + 1, first + 2)
+        last = min(last, NODES - 1)
+    scan.first[f], scan.last[f] = first, last
+    for node in range(first, last + 1):
+        scan.angles[4 * f + 2] = low + (high - low) * node / (NODES - 1)
+        lines.lack[f, 0] = lines.lack[f, 1] = 0.0
+        steps = _start(rig, lines, prior, f, node, scan)
+        cost, length = _descend(rig, lines, prior, f, steps, scan)
+        _keep(rig, lines, prior, f, node, length, scan)
         scan.chi2[f] = min(scan.chi2[f], 2.0 * cost)
-        scan.showing[f, node] = 1.0 if _shows(device, prior, length, scan) else 0.0
     # Where a node happens to lie on a turn of the ridge, its volume is of that pose alone.
-    for node in range(scan.first[f] + 1, scan.last[f]):
+    for node in range(first + 1, last):
         most = max(scan.volume[f, node - 1], scan.volume[f, node + 1])
         scan.volume[f, node] = min(scan.volume[f, node], most)
     scan.known[f] = 1.0
 
 
 @inner
-def _shows(device: Any, prior: Prior, length: float, scan: Scan) -> bool:
+def _start(rig: Rig, lines: LinesOfSight, prior: Prior, f: int, node: int, scan: Scan) -> int:
+    """Set the pose from which a node is searched; return in how many steps.
+
+    From the pose of the PIP before; at the first node, and every few others, rather from one that is tried.
+    """
+    pip, restart, coarse = scan.angles[4 * f + 2], 5, 4
+    dip = prior.base_rad[f, 3] + prior.per_pip[f, 3] * pip
+    aside = prior.base_rad[f, 0] + prior.per_pip[f, 0] * pip
+    best, at = inf, coarse
+    if (node - scan.first[f]) % restart == 0:
+        for start in range(coarse):
+            _put(rig.hand, f, aside, _COARSE_RAD[start], dip, prior.twist[f], scan)
+            _look(rig, prior, f, NO_MOVES, scan)
+            cost = _rows(rig, lines, prior, f, scan)
+            if cost < best:
+                best, at = cost, start
+    if node > scan.first[f]:
+        before = scan.x[f, node - 1]
+        _put(rig.hand, f, before[0], before[1], before[3], before[4], scan)
+        if at < coarse:
+            _look(rig, prior, f, NO_MOVES, scan)
+            at = coarse if _rows(rig, lines, prior, f, scan) < best else at
+    if at < coarse:
+        _put(rig.hand, f, aside, _COARSE_RAD[at], dip, prior.twist[f], scan)
+    from_before, from_tried = 3, 5  # steps
+    return from_before if at == coarse else from_tried
+
+
+@inner
+def _descend(
+    rig: Rig, lines: LinesOfSight, prior: Prior, f: int, steps: int, scan: Scan
+) -> tuple[float, float]:
+    """Search the minimum at one PIP; return half chi square and line length [px]."""
+    a, surface, step, length, cost = scan.angles, scan.surface, scan.S[0], 0.0, 0.0
+    for k in range(steps + 1):
+        _look(rig, prior, f, OWN_MOVES, scan)
+        if k == steps - 1:
+            length = laser_centroid(rig.device, f, surface)
+            if length > 0.0:
+                exact = surface.laser_centroid
+                lines.lack[f, 0] = exact[0] / exact[2] - surface.seen[0]
+                lines.lack[f, 1] = exact[1] / exact[2] - surface.seen[1]
+        cost = _rows(rig, lines, prior, f, scan)
+        if not _factor(scan) or k == steps:
+            break
+        for u in range(4):
+            step[u] = -scan.g[u]
+        substitute(scan.L, 4, step)
+        for u in range(4):
+            farthest_rad = 0.3  # of one step
+            step[u] = min(max(step[u], -farthest_rad), farthest_rad)
+        abduction, flexion, dip = a[4 * f] + step[0], a[4 * f + 1] + step[1], a[4 * f + 3] + step[2]
+        _put(rig.hand, f, abduction, flexion, dip, scan.twist[f] + step[3], scan)
+    return cost, length
+
+
+@inner
+def _keep(rig: Rig, lines: LinesOfSight, prior: Prior, f: int, node: int, length: float, scan: Scan) -> None:
+    """Write where the search at a node has ended."""
+    for k in range(4):
+        scan.x[f, node, k] = scan.angles[4 * f + k]
+    scan.x[f, node, 4] = scan.twist[f]
+    volume = 0.0
+    for u in range(4):
+        volume -= log(scan.L[u, u])
+        scan.S[0, u] = 1.0 if u == 1 else 0.0
+    scan.volume[f, node] = volume - log(_dip_sigma(rig.settings, f, scan.angles[4 * f + 2]))
+    substitute(scan.L, 4, scan.S[0])
+    scan.flexion2[f, node] = scan.S[0, 1]
+    scan.length_px[f, node] = length
+    scan.lack[f, node, 0], scan.lack[f, node, 1] = lines.lack[f, 0], lines.lack[f, 1]
+    for i in range(ROWS):
+        scan.rows[f, node, i] = scan.r[i]
+    scan.showing[f, node] = 1.0 if _shows(prior, length, scan) else 0.0
+
+
+@inner
+def _shows(prior: Prior, length: float, scan: Scan) -> bool:
     """Return whether the fingertip that `look` left is clearly in sight."""
     t = scan.surface.tip
     if not t[2] > 0.0:
@@ -376,14 +328,14 @@ def _by_width(off: float, variance: float, width: float) -> float:
 
 
 @inner
-def _densities(hand: HandTables, settings: Settings, prior: Prior, f: int, unseen: bool, scan: Scan) -> None:
+def _densities(rig: Rig, prior: Prior, f: int, unseen: bool, scan: Scan) -> None:
     """Write the logarithm of the density of finger f (3, 61), by hand."""
-    log_p = scan.log_p[f]
+    hand, settings, log_p = rig.hand, rig.settings, scan.log_p[f]
     low, high = hand.limits[f, 2, 0], hand.limits[f, 2, 1]
     span, length = log(hand.limits[f, 1, 1] - hand.limits[f, 1, 0]), log(high - low)
     free2, straight2 = settings.free_pip_rad**2, settings.straight_pip_rad**2
     free_width, straight_width = 0.5 * log(2.0 * pi * free2), 0.5 * log(2.0 * pi * straight2)
-    for k in range(FINE * (NODES - 1) + 1):
+    for k in range(_PLACES):
         node = min(k // FINE, NODES - 2)
         share = k / FINE - node
         pip = low + (high - low) * k / (FINE * (NODES - 1))
@@ -394,13 +346,13 @@ def _densities(hand: HandTables, settings: Settings, prior: Prior, f: int, unsee
             continue
         chi2 = 0.0
         for i in range(ROWS):
-            row = (1.0 - share) * scan.rows[f, node, i] + share * scan.rows[f, node + 1, i]
+            row = _between(share, scan.rows[f, node, i], scan.rows[f, node + 1, i])
             chi2 += row * row
         base = -0.5 * chi2 + (1.0 - share) * scan.volume[f, node] + share * scan.volume[f, node + 1]
-        flexion = (1.0 - share) * scan.x[f, node, 1] + share * scan.x[f, node + 1, 1]
-        flexion2 = (1.0 - share) * scan.flexion2[f, node] + share * scan.flexion2[f, node + 1]
+        flexion = _between(share, scan.x[f, node, 1], scan.x[f, node + 1, 1])
+        flexion2 = _between(share, scan.flexion2[f, node], scan.flexion2[f, node + 1])
         if unseen:
-            shows = (1.0 - share) * scan.showing[f, node] + share * scan.showing[f, node + 1]
+            shows = _between(share, scan.showing[f, node], scan.showing[f, node + 1])
             base -= (settings.unseen_again if prior.had_previous[f] > 0.0 else settings.unseen) * shows
         off = flexion - prior.base_rad[f, 1] - prior.per_pip[f, 1] * pip
         variance = prior.flexion[f] ** 2 + flexion2
@@ -416,38 +368,39 @@ def _densities(hand: HandTables, settings: Settings, prior: Prior, f: int, unsee
 
 
 @inner
-def weigh_hands(
-    hand: HandTables, settings: Settings, lines_of_sight: LinesOfSight, prior: Prior, scan: Scan
-) -> None:
+def weigh_hands(rig: Rig, lines: LinesOfSight, prior: Prior, scan: Scan) -> None:
     """Write each hand's evidence by fingers whose tips are seen, and probabilities."""
-    others = 0
+    others, share, natural = 0, scan.share, rig.settings.natural_finger_weight
     for f in range(1, 5):
-        others += 1 if lines_of_sight.shown[f] > 0.0 else 0
-    scan.share[_NATURAL] = log(settings.natural_finger_weight)
-    scan.share[_STRAIGHT] = scan.share[_FREE] = log(0.5 * (1.0 - settings.natural_finger_weight))
+        others += 1 if lines.shown[f] > 0.0 else 0
+    share[_NATURAL] = log(natural)
+    share[_STRAIGHT] = share[_FREE] = log(0.5 * (1.0 - natural))
     for f in range(5):
         if scan.known[f] == 0.0:
             continue
-        _densities(hand, settings, prior, f, others > 0 and lines_of_sight.shown[f] == 0.0, scan)
+        _densities(rig, prior, f, others > 0 and lines.shown[f] == 0.0, scan)
         for h in range(HANDS):
-            top = -inf
-            for k in range(FINE * (NODES - 1) + 1):
+            top, total = -inf, 0.0
+            for k in range(_PLACES):
                 top = max(top, scan.log_p[f, h, k])
-            total = 0.0
-            for k in range(FINE * (NODES - 1) + 1):
+            for k in range(_PLACES):
                 total += exp(scan.log_p[f, h, k] - top)
             scan.hand[f, h] = log(total) + top
-            if f > 0 and lines_of_sight.shown[f] > 0.0:
-                scan.share[h] += scan.hand[f, h]
+            if f > 0 and lines.shown[f] > 0.0:
+                share[h] += scan.hand[f, h]
     if prior.natural_only[0] > 0.0:
-        scan.share[_STRAIGHT] = scan.share[_FREE] = -inf
-    top = max(scan.share[0], max(scan.share[1], scan.share[2]))
-    total = 0.0
+        share[_STRAIGHT] = share[_FREE] = -inf
+    top, total = max(share[0], max(share[1], share[2])), 0.0
     for h in range(HANDS):
-        scan.share[h] = exp(scan.share[h] - top)
-        total += scan.share[h]
+        share[h] = exp(share[h] - top)
+        total += share[h]
     for h in range(HANDS):
-        scan.share[h] /= total
+        share[h] /= total
+
+
+@inlined
+def _between(share: float, here: float, there: float) -> float:
+    return (1.0 - share) * here + share * there
 
 
 @inlined
@@ -456,66 +409,20 @@ def _at(scan: Scan, f: int, place: float, out: Float) -> None:
     node = min(int(place / FINE), NODES - 2)
     share = place / FINE - node
     for k in range(5):
-        out[k] = (1.0 - share) * scan.x[f, node, k] + share * scan.x[f, node + 1, k]
+        out[k] = _between(share, scan.x[f, node, k], scan.x[f, node + 1, k])
 
 
 @inner
-def choose(
-    hand: HandTables, settings: Settings, lines_of_sight: LinesOfSight, prior: Prior, f: int, scan: Scan
-) -> None:
+def choose(rig: Rig, lines: LinesOfSight, prior: Prior, f: int, scan: Scan) -> None:
     """Write the estimate of finger f from the densities that `weigh_hands` left.
 
-    It is the median of the part that weighs most, its likeliest pose, and the spread. Two tops are of one
-    part where the density does not fall clearly between them. Where frames follow each other, a part near to
-    where the finger was is preferred.
+    It is the median of the part that weighs most, its likeliest pose, and the spread. Where frames follow
+    each other, a part near to where the finger was is preferred.
     """
-    count, p = FINE * (NODES - 1) + 1, scan.p
-    low, high = hand.limits[f, 2, 0], hand.limits[f, 2, 1]
-    step = (high - low) / (count - 1)
-    total = 0.0
-    for k in range(count):
-        p[k] = 0.0
-        for h in range(HANDS):
-            if scan.share[h] > 0.0:
-                p[k] += scan.share[h] * exp(scan.log_p[f, h, k] - scan.hand[f, h])
-        total += p[k]
-    for k in range(count):
-        p[k] /= total
-        off = (low + k * step - prior.last[f]) / prior.process_noise[f]
-        scan.near[k] = p[k] * exp(-0.5 * off * off) if prior.had_previous[f] > 0.0 else p[k]
-    # Parts: the density is walked from top to top.
-    begin, best_begin, best_end, best, parts = 0, 0, count, -1.0, 0
-    while begin < count:
-        # From `begin` up to the lowest place before another top, if the density clearly falls below both.
-        near = scan.near
-        crest, lowest, low_at, end = near[begin], inf, begin, count
-        for k in range(begin, count):
-            if lowest < settings.parted * min(crest, near[k]):
-                end = low_at
-                break
-            if near[k] > crest:
-                crest, lowest = near[k], inf
-            elif near[k] < lowest:
-                lowest, low_at = near[k], k
-        weight = likely = 0.0
-        for k in range(begin, end):
-            weight += p[k]
-            likely += scan.near[k]
-        if weight > settings.other_part:
-            parts += 1
-        if likely > best:
-            best, best_begin, best_end = likely, begin, end
-        begin = end
-    half, place, crest, crest_at = 0.0, float(best_begin), -1.0, best_begin
-    found = False
-    for k in range(best_begin, best_end):
-        if p[k] > crest:
-            crest, crest_at = p[k], k
-        if not found and half + scan.near[k] >= 0.5 * best:
-            place = k - 0.5 + (0.5 * best - half) / max(scan.near[k], 1e-300)
-            found = True
-        half += scan.near[k]
-    place = min(max(place, 0.0), count - 1.0)
+    low, high = rig.hand.limits[f, 2, 0], rig.hand.limits[f, 2, 1]
+    step = (high - low) / (_PLACES - 1)
+    _mix(prior, f, low, step, scan)
+    place, crest_at = _heaviest(rig.settings, f, scan)
     _at(scan, f, place, scan.out[f])
     _at(scan, f, float(crest_at), scan.mode[f])
     node = min(max(int(place / FINE), 0), NODES - 2)
@@ -523,13 +430,73 @@ def choose(
     for k in range(5):
         scan.way[f, k] = (scan.x[f, node + 1, k] - scan.x[f, node, k]) / away
     scan.pip2[f] = 0.0
-    for k in range(count):
+    for k in range(_PLACES):
         off = low + k * step - scan.out[f, 2]
-        scan.pip2[f] += p[k] * off * off
-    scan.parts[f] = parts
+        scan.pip2[f] += scan.p[k] * off * off
     if isfinite(prior.law[f]):
         for k in range(1, 4):
             scan.out[f, k] = scan.mode[f, k] = prior.base_rad[f, k] + prior.per_pip[f, k] * prior.law[f]
     share = place / FINE - node
     for i in range(2):
-        lines_of_sight.lack[f, i] = (1.0 - share) * scan.lack[f, node, i] + share * scan.lack[f, node + 1, i]
+        lines.lack[f, i] = _between(share, scan.lack[f, node, i], scan.lack[f, node + 1, i])
+
+
+@inlined
+def _mix(prior: Prior, f: int, low: float, step: float, scan: Scan) -> None:
+    """Write the density `p` of all hands, and `near`, by which its place is chosen."""
+    p, total = scan.p, 0.0
+    for k in range(_PLACES):
+        p[k] = 0.0
+        for h in range(HANDS):
+            if scan.share[h] > 0.0:
+                p[k] += scan.share[h] * exp(scan.log_p[f, h, k] - scan.hand[f, h])
+        total += p[k]
+    for k in range(_PLACES):
+        p[k] /= total
+        off = (low + k * step - prior.last[f]) / prior.process_noise[f]
+        scan.near[k] = p[k] * exp(-0.5 * off * off) if prior.had_previous[f] > 0.0 else p[k]
+
+
+@inlined
+def _part(settings: Settings, begin: int, near: Float) -> int:
+    """Return the end of the part of a density that begins there.
+
+    Two tops are of one part where the density does not fall clearly between them. From `begin` up to the
+    lowest place before another top, if it clearly falls below both.
+    """
+    crest, lowest, low_at = near[begin], inf, begin
+    for k in range(begin, _PLACES):
+        if lowest < settings.parted * min(crest, near[k]):
+            return low_at
+        if near[k] > crest:
+            crest, lowest = near[k], inf
+        elif near[k] < lowest:
+            lowest, low_at = near[k], k
+    return _PLACES
+
+
+@inner
+def _heaviest(settings: Settings, f: int, scan: Scan) -> tuple[float, int]:
+    """Return median and top of the heaviest part, in fine steps, and count parts."""
+    p, near, begin, best_begin, best_end, best, parts = scan.p, scan.near, 0, 0, _PLACES, -1.0, 0
+    while begin < _PLACES:
+        end = _part(settings, begin, near)
+        weight = likely = 0.0
+        for k in range(begin, end):
+            weight += p[k]
+            likely += near[k]
+        if weight > settings.other_part:
+            parts += 1
+        if likely > best:
+            best, best_begin, best_end = likely, begin, end
+        begin = end
+    scan.parts[f] = parts
+    half, place, crest, crest_at, found = 0.0, float(best_begin), -1.0, best_begin, False
+    for k in range(best_begin, best_end):
+        if p[k] > crest:
+            crest, crest_at = p[k], k
+        if not found and half + near[k] >= 0.5 * best:
+            place = k - 0.5 + (0.5 * best - half) / max(near[k], 1e-300)
+            found = True
+        half += near[k]
+    return min(max(place, 0.0), _PLACES - 1.0), crest_at

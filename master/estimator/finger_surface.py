@@ -19,8 +19,8 @@ import numpy as np
 
 from common.arrays import Float
 from common.kernels import constant, inlined, inner
-from common.records import record
-from master.estimator.kinematics import abduction_axis, finger_chain
+from common.records import array
+from master.estimator.kinematics import finger_chain, hinge_axis
 from master.estimator.parameters import HandTables
 
 # Abduction, flexion, PIP, DIP, twist, and the wrist's flexion and deviation; all, those of the finger itself, none.
@@ -33,47 +33,25 @@ RAYS = 16
 class Surface:
     """Scratch for one finger."""
 
-    S: Float  # (8, 3) spheres
-    Q: Float  # (9, 3) ridge
-    along: Float  # (8, 3)
-    bone: Float  # (7, 3) unit vectors from sphere to sphere
-    q: Float  # (3,) laser point
-    way: Float  # (3,) of the chain there
-    laser: Float  # (7, 12) terms of the cones from the laser
-    camera: Float  # (7, 12) and from the camera
-    ray: Float  # (3,)
-    lit: Float  # (RAYS, 5) x, y, z, clearness, body
-    reached: Float  # (7,) whether the plane comes near a cone
-    begins: Float  # (7,) no part of a cone is nearer to the camera [m]
-    laser_centroid: Float  # (3,) point of the exact cut
-    R: Float  # (4, 3, 3) joints, camera frame
-    P: Float  # (4, 3)
-    axis: Float  # (7, 3) about which each of `MOVES` turns what is beyond
-    tip: Float  # (3,)
-    seen: Float  # (5,) laser x, y, tip x, y, logarithm of the tip's distance
-    J: Float  # (5, 7) its derivatives by `MOVES`
-
-    @classmethod
-    def empty(cls) -> "Surface":
-        """Allocate it."""
-        return record(
-            cls,
-            **dict.fromkeys(("q", "way", "ray", "laser_centroid", "tip"), 3),
-            S=(8, 3),
-            along=(8, 3),
-            Q=(9, 3),
-            bone=(7, 3),
-            axis=(7, 3),
-            laser=(7, 12),
-            camera=(7, 12),
-            lit=(RAYS, 5),
-            reached=7,
-            begins=7,
-            R=(4, 3, 3),
-            P=(4, 3),
-            seen=5,
-            J=(5, MOVES),
-        )
+    S: Float = array(8, 3)  # spheres
+    Q: Float = array(9, 3)  # ridge
+    along: Float = array(8, 3)
+    bone: Float = array(7, 3)  # unit vectors from sphere to sphere
+    q: Float = array(3)  # laser point
+    way: Float = array(3)  # of the chain there
+    laser: Float = array(7, 12)  # terms of the cones from the laser
+    camera: Float = array(7, 12)  # and from the camera
+    ray: Float = array(3)
+    lit: Float = array(RAYS, 5)  # x, y, z, clearness, body
+    reached: Float = array(7)  # whether the plane comes near a cone
+    begins: Float = array(7)  # no part of a cone is nearer to the camera [m]
+    laser_centroid: Float = array(3)  # point of the exact cut
+    R: Float = array(4, 3, 3)  # joints, camera frame
+    P: Float = array(4, 3)
+    axis: Float = array(7, 3)  # about which each of `MOVES` turns what is beyond
+    tip: Float = array(3)
+    seen: Float = array(5)  # laser x, y, tip x, y, logarithm of the tip's distance
+    J: Float = array(5, MOVES)  # its derivatives by `MOVES`
 
 
 @inner
@@ -224,107 +202,118 @@ def laser_centroid(device: Any, f: int, work: Surface) -> float:
 
     In the undistorted image [px]; 0: the laser misses the finger, or it is not seen.
     """
-    S, laser, lit = work.S, device.laser_m, work.lit
-    a0, a1, a2 = device.plane[0, 0], device.plane[0, 1], device.plane[0, 2]
-    c0, c1, c2 = device.plane[1, 0], device.plane[1, 1], device.plane[1, 2]
-    n, offset = device.plane[2], device.offset[0]
-    low, high, broad = inf, -inf, 0.0
+    S, laser, radius, broad = work.S, device.laser_m, device.radius[f], 0.0
+    for k in range(8):
+        broad = max(broad, 2.0 * radius[k])
+    low, high = _lit_span(device, f, work)
+    if not low < high:
+        return 0.0
     for k in range(7):
-        r1, r2 = device.radius[f, k], device.radius[f, k + 1]
-        _terms(S, k, r1, r2, 0.0, 0.0, 0.0, work.camera[k])
+        _terms(S, k, radius[k], radius[k + 1], 0.0, 0.0, 0.0, work.camera[k])
         rounded_m = 1e-9
-        work.begins[k] = _away(S, k) - max(r1, r2) - rounded_m
-    near = 0.0
+        work.begins[k] = _away(S, k) - max(radius[k], radius[k + 1]) - rounded_m
+        if work.reached[k] > 0.0:
+            _terms(S, k, radius[k], radius[k + 1], laser[0], laser[1], laser[2], work.laser[k])
+    step, first = (high - low) / (RAYS - 1), _ROOT - 1 if f == 0 else 0
+    for ray in range(RAYS):
+        _cast(device, low + ray * step, first, work, work.lit[ray])
+    total = u = v = 0.0
+    for ray in range(RAYS - 1):
+        weight, x, y = _chord(work.lit[ray], work.lit[ray + 1], broad)
+        u += weight * x
+        v += weight * y
+        total += weight
+    if not total > 0.0:
+        return 0.0
+    u, v = u / total, v / total
+    n = device.plane[2]
+    far = device.offset[0] / (n[0] * u + n[1] * v + n[2])
+    work.laser_centroid[0], work.laser_centroid[1], work.laser_centroid[2] = far * u, far * v, far
+    return total * device.focal[0]
+
+
+@inner
+def _lit_span(device: Any, f: int, work: Surface) -> tuple[float, float]:
+    """Return the angles from the laser in which finger f may be lit; write `reached`."""
+    S, laser, radius, n = work.S, device.laser_m, device.radius[f], device.plane[2]
+    low, high, near = inf, -inf, 0.0
     for k in range(7):
         work.reached[k] = 0.0
     for k in range(8):
-        r = device.radius[f, k]
-        x, y, z = S[k, 0] - laser[0], S[k, 1] - laser[1], S[k, 2] - laser[2]
-        height = n[0] * S[k, 0] + n[1] * S[k, 1] + n[2] * S[k, 2] - offset
-        broad = max(broad, 2.0 * r)
+        r = radius[k]
+        height = n[0] * S[k, 0] + n[1] * S[k, 1] + n[2] * S[k, 2] - device.offset[0]
         crosses = k > 0 and (height > 0.0) != (near > 0.0)
         if abs(height) < r or crosses:
             work.reached[max(k - 1, 0)] = 1.0
             work.reached[min(k, 6)] = 1.0
         if crosses:
             share = near / (near - height)
-            bx = S[k - 1, 0] + share * (S[k, 0] - S[k - 1, 0]) - laser[0]
-            by = S[k - 1, 1] + share * (S[k, 1] - S[k - 1, 1]) - laser[1]
-            bz = S[k - 1, 2] + share * (S[k, 2] - S[k - 1, 2]) - laser[2]
-            across, ahead = a0 * bx + a1 * by + a2 * bz, c0 * bx + c1 * by + c2 * bz
-            angle, thick = atan2(across, ahead), max(r, device.radius[f, k - 1])
-            wide = 1.3 * thick / sqrt(across * across + ahead * ahead)
+            x = S[k - 1, 0] + share * (S[k, 0] - S[k - 1, 0]) - laser[0]
+            y = S[k - 1, 1] + share * (S[k, 1] - S[k - 1, 1]) - laser[1]
+            z = S[k - 1, 2] + share * (S[k, 2] - S[k - 1, 2]) - laser[2]
+            angle, away = _in_plane(device, x, y, z)
+            wide = 1.3 * max(r, radius[k - 1]) / away
             low, high = min(low, angle - wide), max(high, angle + wide)
         if abs(height) < r:
-            across, ahead = a0 * x + a1 * y + a2 * z, c0 * x + c1 * y + c2 * z
-            wide = sqrt(r * r - height * height) / sqrt(across * across + ahead * ahead)
-            angle = atan2(across, ahead)
+            angle, away = _in_plane(device, S[k, 0] - laser[0], S[k, 1] - laser[1], S[k, 2] - laser[2])
+            wide = sqrt(r * r - height * height) / away
             low, high = min(low, angle - 1.1 * wide), max(high, angle + 1.1 * wide)
         near = height
-    if not low < high:
-        return 0.0
+    return low, high
+
+
+@inlined
+def _in_plane(device: Any, x: float, y: float, z: float) -> tuple[float, float]:
+    """Return angle and distance from the laser, in its plane."""
+    a, c = device.plane[0], device.plane[1]
+    across, ahead = a[0] * x + a[1] * y + a[2] * z, c[0] * x + c[1] * y + c[2] * z
+    return atan2(across, ahead), sqrt(across * across + ahead * ahead)
+
+
+@inner
+def _cast(device: Any, angle: float, first: int, work: Surface, lit: Float) -> None:
+    """Write what a laser ray meets first (5,), of the cones from `first` on."""
+    laser, a, b = device.laser_m, device.plane[0], device.plane[1]
+    s, c = sin(angle), cos(angle)
+    dx, dy, dz = s * a[0] + c * b[0], s * a[1] + c * b[1], s * a[2] + c * b[2]
+    far, body = inf, -1
     for k in range(7):
         if work.reached[k] > 0.0:
-            r1, r2 = device.radius[f, k], device.radius[f, k + 1]
-            _terms(S, k, r1, r2, laser[0], laser[1], laser[2], work.laser[k])
-    step = (high - low) / (RAYS - 1)
-    first = _ROOT - 1 if f == 0 else 0
-    for ray in range(RAYS):
-        angle = low + ray * step
-        s, c = sin(angle), cos(angle)
-        dx, dy, dz = s * a0 + c * c0, s * a1 + c * c1, s * a2 + c * c2
-        far, body = inf, -1
-        for k in range(7):
-            if work.reached[k] > 0.0:
-                t = first_hit(work.laser[k], dx, dy, dz)
-                if t < far:
-                    far, body = t, k
-        lit[ray, 3], lit[ray, 4] = -inf, body
-        if body < first:
-            continue
-        x, y, z = laser[0] + far * dx, laser[1] + far * dy, laser[2] + far * dz
-        lit[ray, 0], lit[ray, 1], lit[ray, 2] = x, y, z
-        distance = sqrt(x * x + y * y + z * z)
-        if not z > 0.0:
-            continue
-        ex, ey, ez, seen = x / distance, y / distance, z / distance, inf
-        for k in range(7):
-            if work.begins[k] < distance:  # what is farther hides nothing
-                seen = min(seen, first_hit(work.camera[k], ex, ey, ez))
-        seen_m = 3e-4  # a lit point this near behind the first the camera sees is seen
-        lit[ray, 3] = min(seen - distance, 0.0) + seen_m
-    total = u = v = 0.0
-    for ray in range(RAYS - 1):
-        here, there = lit[ray, 3], lit[ray + 1, 3]
-        if not (here > -inf and there > -inf) or (here <= 0.0 and there <= 0.0):
-            continue
-        dx, dy, dz = (
-            lit[ray + 1, 0] - lit[ray, 0],
-            lit[ray + 1, 1] - lit[ray, 1],
-            lit[ray + 1, 2] - lit[ray, 2],
-        )
-        # share of the finger's breadth that one chord may span: more is a jump from part to part
-        stretch = 0.5
-        if dx * dx + dy * dy + dz * dz > (stretch * broad) ** 2:
-            continue
-        begin, end = 0.0, 1.0
-        if here <= 0.0:
-            begin = here / (here - there)
-        if there <= 0.0:
-            end = here / (here - there)
-        x0, y0 = lit[ray, 0] / lit[ray, 2], lit[ray, 1] / lit[ray, 2]
-        x1, y1 = lit[ray + 1, 0] / lit[ray + 1, 2], lit[ray + 1, 1] / lit[ray + 1, 2]
-        weight = (end - begin) * sqrt((x1 - x0) ** 2 + (y1 - y0) ** 2)
-        middle = 0.5 * (begin + end)
-        u += weight * (x0 + middle * (x1 - x0))
-        v += weight * (y0 + middle * (y1 - y0))
-        total += weight
-    if not total > 0.0:
-        return 0.0
-    u, v = u / total, v / total
-    far = offset / (n[0] * u + n[1] * v + n[2])
-    work.laser_centroid[0], work.laser_centroid[1], work.laser_centroid[2] = far * u, far * v, far
-    return total * device.focal[0]
+            t = first_hit(work.laser[k], dx, dy, dz)
+            if t < far:
+                far, body = t, k
+    lit[3], lit[4] = -inf, body
+    if body < first:
+        return
+    x, y, z = laser[0] + far * dx, laser[1] + far * dy, laser[2] + far * dz
+    lit[0], lit[1], lit[2] = x, y, z
+    distance = sqrt(x * x + y * y + z * z)
+    if not z > 0.0:
+        return
+    ex, ey, ez, seen = x / distance, y / distance, z / distance, inf
+    for k in range(7):
+        if work.begins[k] < distance:  # what is farther hides nothing
+            seen = min(seen, first_hit(work.camera[k], ex, ey, ez))
+    seen_m = 3e-4  # a lit point this near behind the first the camera sees is seen
+    lit[3] = min(seen - distance, 0.0) + seen_m
+
+
+@inlined
+def _chord(here: Float, there: Float, broad: float) -> tuple[float, float, float]:
+    """Return length and middle of what is seen between two lit points."""
+    a, b = here[3], there[3]
+    if not (a > -inf and b > -inf) or (a <= 0.0 and b <= 0.0):
+        return 0.0, 0.0, 0.0
+    dx, dy, dz = there[0] - here[0], there[1] - here[1], there[2] - here[2]
+    stretch = 0.5  # share of the finger's breadth that one chord may span: more is a jump from part to part
+    if dx * dx + dy * dy + dz * dz > (stretch * broad) ** 2:
+        return 0.0, 0.0, 0.0
+    begin = a / (a - b) if a <= 0.0 else 0.0
+    end = a / (a - b) if b <= 0.0 else 1.0
+    x0, y0, x1, y1 = here[0] / here[2], here[1] / here[2], there[0] / there[2], there[1] / there[2]
+    weight = (end - begin) * sqrt((x1 - x0) ** 2 + (y1 - y0) ** 2)
+    middle = 0.5 * (begin + end)
+    return weight, x0 + middle * (x1 - x0), y0 + middle * (y1 - y0)
 
 
 @inner
@@ -360,9 +349,9 @@ def look(
     seen[0], seen[1], seen[2], seen[3], seen[4] = x, y, tx, ty, log(max(t[2], 1e-3))
     if moves == 0:
         return at
-    abduction_axis(hand, T, f, A[0])
+    for k in range(4):
+        A[k, 0], A[k, 1], A[k, 2] = hinge_axis(hand, T, R, f, k)
     for i in range(3):
-        A[1, i], A[2, i], A[3, i] = -R[0, i, 0], -R[1, i, 0], -R[2, i, 0]
         A[4, i] = 0.0
         A[5, i], A[6, i] = wrist_axes[0, i], wrist_axes[1, i]
     # The twist turns about the first bone as it is before the flexion.

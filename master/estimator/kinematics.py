@@ -10,7 +10,7 @@ six of the palm, then those of the finger (`HandTables.first`). What turns about
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import cos, sin, sqrt
 from typing import Any
 
@@ -18,11 +18,11 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.geometry.transforms import skew
-from common.hand.model import CHAINS, Chains, HandJoints, HandModel
+from common.hand.model import CHAINS, Chains, HandModel
 from common.kernels import constant, inlined, inner, kernel
-from common.records import record
+from common.records import array
 from master.estimator.parameters import HandParameters, HandTables, Mounts
-from master.fabrik.linear_algebra import copy
+from master.fabrik.linear_algebra import Vector, copy
 
 PLACE, DIRECTION = constant(0), constant(1)
 
@@ -30,49 +30,39 @@ PLACE, DIRECTION = constant(0), constant(1)
 class Scratch:
     """Scratch of kernels; it holds nothing from one call to the next."""
 
-    uv: Float  # (2,)
-    J: Float  # (2, 3)
-    K: Float  # (3, 3)
-    gain: Float  # (3,)
-    left: Float  # (3, 3)
-    gained: Float  # (3, 3)
-    H: Float  # (3, 3)
-    g: Float  # (3,)
-    by_place: Float  # (10, 3)
-    rows: Float  # (10, 3)
-    angles: Float  # (20,)
-    by: Float  # (20, 4)
-    R: Float  # (5, 4, 3, 3)
-    P: Float  # (5, 4, 3)
-    point: Float  # (3,)
-    arm: Float  # (3,)
-    ahead: Float  # (3,)
-    palm: Float  # (4, 4)
+    uv: Float = array(2)
+    J: Float = array(2, 3)
+    K: Float = array(3, 3)
+    gain: Float = array(3)
+    left: Float = array(3, 3)
+    gained: Float = array(3, 3)
+    H: Float = array(3, 3)
+    g: Float = array(3)
+    by_place: Float = array(10, 3)
+    rows: Float = array(10, 3)
+    angles: Float = array(20)
+    by: Float = array(20, 4)
+    R: Float = array(5, 4, 3, 3)
+    P: Float = array(5, 4, 3)
+    point: Float = array(3)
+    arm: Float = array(3)
+    ahead: Float = array(3)
+    palm: Float = array(4, 4)
 
-    @classmethod
-    def empty(cls) -> "Scratch":
-        """Allocate it."""
-        return record(
-            cls,
-            **dict.fromkeys(("K", "left", "gained", "H"), (3, 3)),
-            **dict.fromkeys(("gain", "g", "point", "arm", "ahead"), 3),
-            uv=2,
-            J=(2, 3),
-            by_place=(10, 3),
-            rows=(10, 3),
-            angles=20,
-            by=(20, 4),
-            R=(5, 4, 3, 3),
-            P=(5, 4, 3),
-            palm=(4, 4),
-        )
+
+@inlined
+def _narrowed(tables: HandTables, f: int, flexion: float) -> tuple[float, float]:
+    """Return a flexion as share of the highest, and what it leaves of abduction."""
+    flexed = min(max(flexion, 0.0), tables.most[f]) / tables.most[f]
+    return flexed, 1.0 - (1.0 - tables.left[f]) * flexed * flexed
 
 
 @inner
-def angles_of(tables: HandTables, x: Float, angles: Float, by: Float) -> None:
-    """Write all angles (20,) [rad] of the free (n,); by (20, 4): their derivatives."""
+def angles_of(tables: HandTables, x: Float, work: Scratch) -> None:
+    """Write all `angles` of the free (n,) [rad], and `by`, their derivatives."""
+    angles, by = work.angles, work.by
     for f in range(5):
-        start, count = tables.first[f], tables.first[f + 1] - tables.first[f]
+        start, count = int(tables.first[f]), int(tables.first[f + 1] - tables.first[f])
         for a in range(4 * f, 4 * f + 4):
             total = 0.0
             for k in range(count):
@@ -80,8 +70,7 @@ def angles_of(tables: HandTables, x: Float, angles: Float, by: Float) -> None:
                 total += tables.complete[a, k] * x[start + k]
             angles[a] = total
         if tables.narrows[f]:  # abduction and flexion are always free
-            flexed = min(max(x[start + 1], 0.0), tables.most[f]) / tables.most[f]
-            share = 1.0 - (1.0 - tables.left[f]) * flexed * flexed
+            flexed, share = _narrowed(tables, f, float(x[start + 1]))
             angles[4 * f] = share * x[start]
             by[4 * f, 0] = share
             by[4 * f, 1] = -2.0 * (1.0 - tables.left[f]) * flexed / tables.most[f] * x[start]
@@ -91,12 +80,11 @@ def angles_of(tables: HandTables, x: Float, angles: Float, by: Float) -> None:
 def free_of(tables: HandTables, angles: Float, x: Float) -> None:
     """Write free angles (n,) of all (20,) [rad]: `HandParameters.of_angles`."""
     for f in range(5):
-        start, count = tables.first[f], tables.first[f + 1] - tables.first[f]
+        start, count = int(tables.first[f]), int(tables.first[f + 1] - tables.first[f])
         for k in range(count):
             x[start + k] = angles[4 * f + k]
         if tables.narrows[f]:
-            flexed = min(max(x[start + 1], 0.0), tables.most[f]) / tables.most[f]
-            x[start] /= max(1.0 - (1.0 - tables.left[f]) * flexed * flexed, 1e-6)
+            x[start] /= max(_narrowed(tables, f, float(x[start + 1]))[1], 1e-6)
         for k in range(start, start + count):
             x[k] = min(max(x[k], tables.low[k]), tables.high[k])
 
@@ -109,18 +97,16 @@ def clamp(tables: HandTables, angles: Float) -> None:
             a = 4 * f + k
             angles[a] = min(max(angles[a], tables.limits[f, k, 0]), tables.limits[f, k, 1])
         if tables.narrows[f]:
-            flexed = min(max(angles[4 * f + 1], 0.0), tables.most[f]) / tables.most[f]
-            left = 1.0 - (1.0 - tables.left[f]) * flexed * flexed
-            angles[4 * f] = min(
-                max(angles[4 * f], left * tables.limits[f, 0, 0]), left * tables.limits[f, 0, 1]
-            )
+            _, left = _narrowed(tables, f, angles[4 * f + 1])
+            low, high = left * tables.limits[f, 0, 0], left * tables.limits[f, 0, 1]
+            angles[4 * f] = min(max(angles[4 * f], low), high)
 
 
 @inner
-def chains(tables: HandTables, T: Float, angles: Float, R: Float, P: Float) -> None:
-    """Write joint rotations R (5, 4, 3, 3) and places P (5, 4, 3) [m], rig frame."""
+def chains(tables: HandTables, T: Float, work: Scratch) -> None:
+    """Write the joints' rotations `R` and places `P` by `angles`, rig frame."""
     for f in range(5):
-        finger_chain(tables, T, angles, f, R[f], P[f])
+        finger_chain(tables, T, work.angles, f, work.R[f], work.P[f])
 
 
 @inner
@@ -156,12 +142,16 @@ def finger_chain(tables: HandTables, T: Float, angles: Float, f: int, R: Float, 
 
 
 @inlined
-def abduction_axis(tables: HandTables, T: Float, f: int, out: Float) -> None:
-    """Write the axis (3,), in the frame of T, about which finger f abducts."""
-    for i in range(3):
-        out[i] = 0.0
-        for j in range(3):
-            out[i] += T[i, j] * tables.abduction_axis[f, j]
+def hinge_axis(tables: HandTables, T: Float, R: Float, f: int, k: int) -> Vector:
+    """Return axis k of finger f: abduction, flexion, PIP, DIP; R (4, 3, 3)."""
+    if k > 0:
+        return -R[k - 1, 0, 0], -R[k - 1, 1, 0], -R[k - 1, 2, 0]
+    x = y = z = 0.0
+    for j in range(3):
+        x += T[0, j] * tables.abduction_axis[f, j]
+        y += T[1, j] * tables.abduction_axis[f, j]
+        z += T[2, j] * tables.abduction_axis[f, j]
+    return x, y, z
 
 
 @inner
@@ -174,37 +164,25 @@ def twist_hand(tables: HandTables, twist: Float) -> None:
         if tables.twist[f] == twist[f]:
             continue
         tables.twist[f] = twist[f]
-        c, s = cos(twist[f]), sin(twist[f])
+        c, s, Q = cos(twist[f]), sin(twist[f]), tables.product
         x, y, z = tables.twist_axis[f, 0], tables.twist_axis[f, 1], tables.twist_axis[f, 2]
-        Q = tables.product
-        Q[0, 0], Q[0, 1], Q[0, 2] = (
-            c + x * x * (1.0 - c),
-            x * y * (1.0 - c) - z * s,
-            x * z * (1.0 - c) + y * s,
-        )
-        Q[1, 0], Q[1, 1], Q[1, 2] = (
-            y * x * (1.0 - c) + z * s,
-            c + y * y * (1.0 - c),
-            y * z * (1.0 - c) - x * s,
-        )
-        Q[2, 0], Q[2, 1], Q[2, 2] = (
-            z * x * (1.0 - c) - y * s,
-            z * y * (1.0 - c) + x * s,
-            c + z * z * (1.0 - c),
-        )
+        k = 1.0 - c
+        Q[0, 0], Q[0, 1], Q[0, 2] = c + x * x * k, x * y * k - z * s, x * z * k + y * s
+        Q[1, 0], Q[1, 1], Q[1, 2] = y * x * k + z * s, c + y * y * k, y * z * k - x * s
+        Q[2, 0], Q[2, 1], Q[2, 2] = z * x * k - y * s, z * y * k + x * s, c + z * z * k
         for part in range(3):
             for i in range(3):
                 for j in range(3):
                     total = 0.0
-                    for k in range(3):
-                        total += tables.untwisted[part, f, i, k] * Q[k, j]
+                    for a in range(3):
+                        total += tables.untwisted[part, f, i, a] * Q[a, j]
                     tables.swing[part, f, 0, i, j] = total
 
 
 @inlined
-def marker_point(mounts: Mounts, m: int, T: Float, R: Float, P: Float, out: Float) -> None:
-    """Write where marker m sits (3,) [m], rig frame."""
-    f, k = mounts.finger[m], mounts.level[m]
+def marker_point(mounts: Mounts, m: int, T: Float, work: Scratch, out: Float) -> None:
+    """Write where marker m sits (3,) [m], rig frame, by `chains`."""
+    f, k, R, P = mounts.finger[m], mounts.level[m], work.R, work.P
     for i in range(3):
         total = P[f, k, i] if f >= 0 else T[i, 3]
         for j in range(3):
@@ -215,15 +193,16 @@ def marker_point(mounts: Mounts, m: int, T: Float, R: Float, P: Float, out: Floa
 @inner
 def markers_of(tables: HandTables, mounts: Mounts, T: Float, x: Float, work: Scratch, out: Float) -> None:
     """Write where the markers of a hand are (M, 3) [m], rig frame."""
-    angles_of(tables, x, work.angles, work.by)
-    chains(tables, T, work.angles, work.R, work.P)
+    angles_of(tables, x, work)
+    chains(tables, T, work)
     for m in range(mounts.finger.shape[0]):
-        marker_point(mounts, m, T, work.R, work.P, out[m])
+        marker_point(mounts, m, T, work, out[m])
 
 
 @inner
-def joints(tables: HandTables, T: Float, R: Float, P: Float, position: Float, rotation: Float) -> None:
-    """Write the 26 joints (26, 3) [m], (26, 3, 3), rig frame, of `chains`."""
+def joints(tables: HandTables, T: Float, work: Scratch, position: Float, rotation: Float) -> None:
+    """Write the 26 joints (26, 3) [m], (26, 3, 3), rig frame, by `chains`."""
+    R, P = work.R, work.P
     for joint in range(26):
         f, k = tables.finger[joint], tables.level[joint]
         for i in range(3):
@@ -253,35 +232,20 @@ def palm_jacobian(arm: Float, J: Float) -> None:
 
 @inlined
 def finger_jacobian(
-    tables: HandTables,
-    by: Float,
-    T: Float,
-    R: Float,
-    P: Float,
-    f: int,
-    level: int,
-    point: Float,
-    what: int,
-    J: Float,
+    tables: HandTables, T: Float, work: Scratch, f: int, level: int, point: Float, what: int, J: Float
 ) -> None:
     """Write J[6:] of (10, 3): derivatives by the free angles of finger f.
 
     Of a point (3,) [m], rig frame, on joint `level` of its chain, or of a direction (3,): `what` is PLACE or
-    DIRECTION. `by` is as of `angles_of`.
+    DIRECTION.
     """
+    R, P, by = work.R, work.P, work.by
     count = tables.first[f + 1] - tables.first[f]
     for c in range(count):
         for i in range(3):
             J[6 + c, i] = 0.0
     for k in range(min(level, 2) + 2):
-        if k == 0:
-            ax = ay = az = 0.0
-            for j in range(3):
-                ax += T[0, j] * tables.abduction_axis[f, j]
-                ay += T[1, j] * tables.abduction_axis[f, j]
-                az += T[2, j] * tables.abduction_axis[f, j]
-        else:
-            ax, ay, az = -R[f, k - 1, 0, 0], -R[f, k - 1, 1, 0], -R[f, k - 1, 2, 0]
+        ax, ay, az = hinge_axis(tables, T, R[f], f, k)
         dx, dy, dz = point[0], point[1], point[2]
         if what == PLACE:
             joint = max(k - 1, 0)
@@ -293,6 +257,26 @@ def finger_jacobian(
                 J[6 + c, 0] += share * tx
                 J[6 + c, 1] += share * ty
                 J[6 + c, 2] += share * tz
+
+
+@inlined
+def marker_jacobian(
+    tables: HandTables, mounts: Mounts, m: int, T: Float, work: Scratch, J: Float
+) -> tuple[int, int]:
+    """Write where marker m is, to `point`, and its derivatives J (10, 3).
+
+    By the palm (6), then by the free angles of its finger. Returns how many, and the column of the first angle.
+    """
+    f, size, start = mounts.finger[m], 6, 0
+    marker_point(mounts, m, T, work, work.point)
+    for i in range(3):
+        work.arm[i] = work.point[i] - T[i, 3]
+    palm_jacobian(work.arm, J)
+    if f >= 0:
+        start = int(tables.first[f])
+        size += int(tables.first[f + 1]) - start
+        finger_jacobian(tables, T, work, f, mounts.level[m], work.point, PLACE, J)
+    return size, start
 
 
 @inlined
@@ -380,10 +364,10 @@ def pose(
     clamp(hand, angles)
     for a in range(20):
         work.angles[a] = angles[a]
-    chains(hand, work.palm, work.angles, work.R, work.P)
-    joints(hand, work.palm, work.R, work.P, position, rotation)
+    chains(hand, work.palm, work)
+    joints(hand, work.palm, work, position, rotation)
     for m in range(mounts.finger.shape[0]):
-        marker_point(mounts, m, work.palm, work.R, work.P, out[m])
+        marker_point(mounts, m, work.palm, work, out[m])
 
 
 @kernel
@@ -414,23 +398,7 @@ class BodyPoints:
         Raises:
             CalibrationError: The profile mounts no marker of one of the names.
         """
-        mounts = Mounts.of(model, names)
-        return cls._of(model, parameters, mounts.finger, mounts.level, mounts.offset_m)
-
-    @classmethod
-    def joints(cls, model: HandModel, parameters: HandParameters) -> "BodyPoints":
-        """The 26 joints themselves."""
-        finger, level = np.full(26, -1), np.zeros(26, int)
-        for f, chain in enumerate(CHAINS):
-            finger[chain], level[chain] = f, np.arange(4)
-        offset_m = np.where((finger < 0)[:, None], model.rest_position_m, 0.0)
-        return cls._of(model, parameters, finger, level, offset_m)
-
-    @classmethod
-    def _of(
-        cls, model: HandModel, parameters: HandParameters, finger: Int, level: Int, offset_m: Float
-    ) -> "BodyPoints":
-        """Build points of chains (P,), -1: the palm, levels (P,), places there (P, 3)."""
+        finger, level, offset_m, _ = Mounts.of(model, names)
         moves = np.zeros((len(finger), 4, len(parameters.free)))
         for p in np.flatnonzero(finger >= 0):
             used = min(int(level[p]), 2) + 2
@@ -441,25 +409,11 @@ class BodyPoints:
         on_finger = (finger >= 0)[:, None]
         return cls(np.maximum(finger, 0), level, on_finger, offset_m, moves, axis, parameters)
 
-    def only(self, use: Bool) -> "BodyPoints":
-        """The points where `use` (P,) is true."""
-        if use.all():
-            return self
-        by_point = "finger", "level", "on_finger", "offset_m", "moves"
-        return replace(self, **{name: getattr(self, name)[use] for name in by_point})
-
     def place(self, chains: Chains) -> Float:
         """Return the points (..., P, 3) [m], palm frame, of poses (...)."""
         R = chains.rotation[..., self.finger, self.level, :, :]
         p = chains.position_m[..., self.finger, self.level, :]
         return np.where(self.on_finger, p + (R @ self.offset_m[..., None])[..., 0], self.offset_m)
-
-    def on(self, joints: HandJoints) -> Float:
-        """Where the points are (P, 3) [m], rig frame, on a hand whose joints are there."""
-        T, at = joints.T_rig_palm, CHAINS[self.finger, self.level]
-        R = np.where(self.on_finger[..., None], joints.rotation[at], T[:3, :3])
-        p = np.where(self.on_finger, joints.position_m[at], T[:3, 3])
-        return p + (R @ self.offset_m[..., None])[..., 0]
 
     def jacobian(self, chains: Chains, points_m: Float, x: Float) -> Float:
         """Return derivatives (..., P, 3, n) [m/rad] of points at x (..., n)."""

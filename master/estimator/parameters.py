@@ -30,7 +30,7 @@ from common.arrays import Bool, Float, Int
 from common.hand.model import CHAINS, FINGER_JOINTS, HandModel
 from common.hand.profiles import ABDUCTION, FLEXION, spread_left
 from common.kernels import inlined, inner
-from common.records import filled, record
+from common.records import array, filled, record
 from master.fabrik.linear_algebra import cholesky, inverse
 
 _PALM = (1.0, 0.1)  # [rad], [m]: a hand in front of cameras, before anything is seen of it
@@ -99,10 +99,6 @@ class HandParameters:
             x[..., self.abduction] *= self._share(self._flexed(x))
         return (x @ self.complete.T).reshape(*x.shape[:-1], 5, 4)
 
-    def by_angles(self, x: Float) -> Float:
-        """Derivatives (20, n) of all angles by the free ones at x (n,)."""
-        return self.by_parameters(self.complete[:, None].copy(), x)[:, 0]
-
     def by_parameters(self, J: Float, x: Float) -> Float:
         """Convert derivatives by free angles to those by parameters x (..., n), in place."""
         if len(self.most):
@@ -144,33 +140,39 @@ def _evenly(columns: Int) -> Int | slice:
 class HandTables:
     """A hand profile with n free angles, as flat arrays for kernels."""
 
-    swing: Float  # (3, 5, 4, 3, 3) as `HandModel.swing`
-    tip_rotation: Float  # (5, 3, 3) rest rotation of the tip in the frame of the joint before it
-    root_m: Float  # (5, 3) first joint of each chain, palm frame [m]
-    bone_m: Float  # (5, 3, 3) bones in the frames of their joints [m]
-    abduction_axis: Float  # (5, 3) palm frame
-    first: Int  # (6,) columns of the free angles of finger f are first[f] ... first[f + 1] - 1
-    complete: Float  # (20, 4) all angles by the free ones of their finger, abductions not narrowed
-    narrows: Bool  # (5,) whether flexion narrows the finger's abduction
-    most: Float  # (5,) [rad] highest flexion
-    left: Float  # (5,) share of the abduction left there
-    low: Float  # (n,) from here to `anywhere` as of `HandParameters`
-    high: Float
-    legal_low: Float
-    legal_high: Float
-    beyond_w2: Float
-    at_low_limit: Bool
-    anywhere: Float
-    limits: Float  # (5, 4, 2) [rad] low and high of all angles, abductions not narrowed
-    finger: Int  # (26,) chain of each joint, -1: fixed to the palm
-    level: Int  # (26,) its place in the chain
-    middle: Int  # (26,) PIP of its finger, a metacarpal's too; thumb, palm, wrist: the joint itself
-    rest_m: Float  # (26, 3) [m] place, palm frame, and `rest_R` rotation of those fixed to the palm
-    rest_R: Float
-    twist: Float  # (5,) [rad] roll of each finger's hinges about its first bone, in `swing` (`twist_hand`)
-    twist_axis: Float  # (5, 3) that bone, in the frame of the abduction
-    untwisted: Float  # (3, 5, 3, 3) `swing` of the abductions with hinges as the profile has them
-    product: Float  # (3, 3) scratch
+    swing: Float = array(3, 5, 4, 3, 3)  # as `HandModel.swing`
+    tip_rotation: Float = array(5, 3, 3)  # rest rotation of the tip in the frame of the joint before it
+    root_m: Float = array(5, 3)  # first joint of each chain, palm frame [m]
+    bone_m: Float = array(5, 3, 3)  # bones in the frames of their joints [m]
+    abduction_axis: Float = array(5, 3)  # palm frame
+    first: Int = array(
+        6, kind="i8"
+    )  # columns of the free angles of finger f are first[f] ... first[f + 1] - 1
+    complete: Float = array(20, 4)  # all angles by the free ones of their finger, abductions not narrowed
+    narrows: Bool = array(5, kind="u1")  # whether flexion narrows the finger's abduction
+    most: Float = array(5)  # [rad] highest flexion
+    left: Float = array(5)  # share of the abduction left there
+    low: Float = array("n")  # from here to `anywhere` as of `HandParameters`
+    high: Float = array("n")
+    legal_low: Float = array("n")
+    legal_high: Float = array("n")
+    beyond_w2: Float = array("n")
+    at_low_limit: Bool = array("n", kind="u1")
+    anywhere: Float = array("6+n")
+    limits: Float = array(5, 4, 2)  # [rad] low and high of all angles, abductions not narrowed
+    finger: Int = array(26, kind="i8")  # chain of each joint, -1: fixed to the palm
+    level: Int = array(26, kind="i8")  # its place in the chain
+    middle: Int = array(
+        26, kind="i8"
+    )  # PIP of its finger, a metacarpal's too; thumb, palm, wrist: the joint itself
+    rest_m: Float = array(26, 3)  # [m] place, palm frame, and `rest_R` rotation of those fixed to the palm
+    rest_R: Float = array(26, 3, 3)
+    twist: Float = array(
+        5
+    )  # [rad] roll of each finger's hinges about its first bone, in `swing` (`twist_hand`)
+    twist_axis: Float = array(5, 3)  # that bone, in the frame of the abduction
+    untwisted: Float = array(3, 5, 3, 3)  # `swing` of the abductions with hinges as the profile has them
+    product: Float = array(3, 3)  # scratch
 
     @classmethod
     def of(cls, model: HandModel, parameters: HandParameters) -> "HandTables":
@@ -192,37 +194,34 @@ class HandTables:
         most = np.ascontiguousarray(model.limits_rad[:, 1, 1])
         first_bone = np.einsum("fij,fj->fi", model.swing[:2, :, 1].sum(axis=0), model.bone_m[:, 0])
         stiff_rad = 1e-9  # an angle whose highest flexion is 0 narrows nothing
-        tables: dict[str, Float | Int | Bool] = {
-            "swing": model.swing,
-            "tip_rotation": model.link_rotation[:, 2],
-            "root_m": model.rest_position_m[CHAINS[:, 0]],
-            "bone_m": model.bone_m,
-            "abduction_axis": axis,
-            "first": first,
-            "complete": complete,
-            "narrows": (model.spread_at_full_flexion < 1.0) & (most > 0.0),
-            "most": np.maximum(most, stiff_rad),
-            "left": model.spread_at_full_flexion,
-            "low": parameters.low,
-            "high": parameters.high,
-            "legal_low": parameters.legal_low,
-            "legal_high": parameters.legal_high,
-            "beyond_w2": parameters.beyond_w2,
-            "at_low_limit": parameters.at_low_limit,
-            "anywhere": parameters.anywhere,
-            "limits": model.limits_rad
-            + REACH * np.stack([-model.tolerance_rad, model.tolerance_rad], axis=2),
-            "finger": finger,
-            "level": level,
-            "middle": middle,
-            "rest_m": model.rest_position_m,
-            "rest_R": model.rest_rotation,
-            "twist": np.zeros(5),
-            "twist_axis": first_bone / np.linalg.norm(first_bone, axis=1, keepdims=True),
-            "untwisted": model.swing[:, :, 0],
-            "product": np.zeros((3, 3)),
-        }
-        return filled(cls, tables)
+        return filled(
+            record(cls, n=len(parameters.free)),
+            swing=model.swing,
+            tip_rotation=model.link_rotation[:, 2],
+            root_m=model.rest_position_m[CHAINS[:, 0]],
+            bone_m=model.bone_m,
+            abduction_axis=axis,
+            first=first,
+            complete=complete,
+            narrows=(model.spread_at_full_flexion < 1.0) & (most > 0.0),
+            most=np.maximum(most, stiff_rad),
+            left=model.spread_at_full_flexion,
+            low=parameters.low,
+            high=parameters.high,
+            legal_low=parameters.legal_low,
+            legal_high=parameters.legal_high,
+            beyond_w2=parameters.beyond_w2,
+            at_low_limit=parameters.at_low_limit,
+            anywhere=parameters.anywhere,
+            limits=model.limits_rad + REACH * np.stack([-model.tolerance_rad, model.tolerance_rad], axis=2),
+            finger=finger,
+            level=level,
+            middle=middle,
+            rest_m=model.rest_position_m,
+            rest_R=model.rest_rotation,
+            twist_axis=first_bone / np.linalg.norm(first_bone, axis=1, keepdims=True),
+            untwisted=model.swing[:, :, 0],
+        )
 
 
 class Mounts(NamedTuple):
@@ -257,18 +256,13 @@ class Mounts(NamedTuple):
 class Cut:
     """Scratch for the mean within limits, of N unknowns, of which n are angles."""
 
-    weight: Float  # (n,)
-    push: Float  # (n,)
-    pull: Float  # (N,)
-    total: Float  # (N, N)
-    L: Float  # (N, N)
-    work: Float  # (N, N)
-    cov: Float  # (N, N)
-
-    @classmethod
-    def empty(cls, n: int, N: int) -> "Cut":
-        """Allocate it."""
-        return record(cls, weight=n, push=n, pull=N, total=(N, N), L=(N, N), work=(N, N), cov=(N, N))
+    weight: Float = array("n")
+    push: Float = array("n")
+    pull: Float = array("N")
+    total: Float = array("N", "N")
+    L: Float = array("N", "N")
+    work: Float = array("N", "N")
+    cov: Float = array("N", "N")
 
 
 @inlined

@@ -14,7 +14,7 @@ heading of which nothing is known is taken from the hand as it was solved, and l
 
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from math import acos, atan2, hypot, isnan, nan, sin, sqrt
 from typing import TYPE_CHECKING
@@ -34,7 +34,7 @@ from common.geometry.transforms import (
 )
 from common.hand.model import HandModel
 from common.kernels import bound
-from common.messages import HandPose, MarkerDetections, restamped
+from common.messages import Detections, HandPose, WristDetections, restamped
 from master.estimator.epoch import (
     Epoch,
     Fitted,
@@ -51,7 +51,7 @@ from master.estimator.smoothing import HandOneEuro
 from master.fabrik.caps import LensShift
 from master.fabrik.intersection import Prior, among, associate, triangulate
 from master.fabrik.rays import RayPositions, RayTriangulator
-from master.fabrik.solver import FabrikSolver
+from master.fabrik.solver import FabrikSolver, Stage
 from master.fabrik.sync import FrameSet
 
 if TYPE_CHECKING:  # it imports this file
@@ -230,7 +230,6 @@ def rotation_of(key: str, value: Quaternion | None) -> Float:
     return quaternion_to_matrix(np.array(value))
 
 
-Stage = Callable[[str], AbstractContextManager[None]]
 _NAME = 64  # characters of a name in `Health`
 
 
@@ -260,6 +259,7 @@ class MarkerPipeline:
         volume: Volume | None = None,
         imu: ImuCalibration | None = None,
         side: "WristSide | None" = None,
+        slowest_hz: float = 60.0,
         counts: Counter[str] | None = None,
         stage: Stage = lambda name: nullcontext(),
         dropped_epochs: Callable[[], bool] | None = None,
@@ -276,6 +276,8 @@ class MarkerPipeline:
             volume: Joints report whether they lie in it; None: none is stated.
             imu: On the palm; used where the rig states how it is mounted and how its world lies.
             side: Wrist device and IMU on the forearm of this hand; None: there are none.
+            slowest_hz: Frame rate of the slowest camera; when longer than its frames take no epoch came, the
+                strobe cycles of the wrist device lead.
             stage: Opens a timer by stage name.
             dropped_epochs: Asked for each epoch whether to drop it for newer ones; None: none is.
         """
@@ -291,6 +293,9 @@ class MarkerPipeline:
         self._joint = np.array([0 if joint is None else joint for joint in joints])  # 0: the palm
         self._stage, self._volume, self._dropped_epochs, self._side = stage, volume, dropped_epochs, side
         self._orientation = None if imu is None or not imu.placed else OrientationTrack(imu, self.counts)
+        silent_frames = 2.2
+        self._silent_ns = round(silent_frames * 1e9 / slowest_hz)
+        self._by_cameras_ns: int | None = None
         self._last_ns = -(2**63)
         self._late_ns = {name: round(1e3 * us) for name, us in (stamp_offset_us or {}).items()}
         self._last: Fitted | None = None
@@ -298,30 +303,39 @@ class MarkerPipeline:
         never_ns = -(2**62)
         self._was_ns: Int = np.full(len(markers), never_ns, np.int64)
 
-    def push(self, message: MarkerDetections) -> list[SolvedPose]:
-        """Take one camera's detections; return the poses they complete, oldest first."""
+    def push(self, message: Detections) -> list[SolvedPose]:
+        """Take what one camera saw; return the poses it completes, oldest first."""
+        if isinstance(message, WristDetections):
+            return self._push_cycle(message)
         if late_ns := self._late_ns.get(message.camera):
             message = restamped(message, t_ns=message.t_ns + late_ns)
         with self._stage("frame_sync"):
             sets = self._line.sync.push(message)
         if self._line.sync.stale:
             self.counts["instants_outdated"] = self._line.sync.stale
-        return self._solved(sets)
+        poses = self._solved(sets)
+        if poses:
+            self._by_cameras_ns = poses[-1].pose.t_ns
+        return poses
 
-    def no_observation(self, t_ns: int, ready_t_ns: int) -> SolvedPose | None:
-        """Return the pose of an epoch no camera saw, by other sensors; None: it is past."""
+    def _push_cycle(self, cycle: WristDetections) -> list[SolvedPose]:
+        """Take a strobe cycle; it waits for an epoch, or is one without cameras."""
+        t_ns, last_ns = None if self._side is None else self._side.push(cycle), self._by_cameras_ns
+        if t_ns is None or (last_ns is not None and t_ns - last_ns <= self._silent_ns):
+            return []
         shape = (len(self._names), len(self.markers))
         unseen, nothing = np.full(shape, np.nan), np.full((*shape, 2), np.nan)
         missing = np.ones(len(self._names), np.bool_)
-        poses = self._solved([FrameSet(t_ns, nothing, unseen, unseen, ready_t_ns, missing)])
-        return poses[0] if poses else None
+        self.counts["poses_by_wrist"] += 1
+        return self._solved([FrameSet(t_ns, nothing, unseen, unseen, cycle.ready_t_ns, missing)])
 
     def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
         """Take the orientation (4,) of the IMU, for the epochs about `t_ns`."""
-        if self._orientation is None:
+        imu = self._orientation if self._side is None else self._side.forearm
+        if imu is None:
             self.counts["orientation.unplaced"] += 1
         else:
-            self._orientation.push(t_ns, orientation_wxyz, heading_sigma_rad)
+            imu.push(t_ns, orientation_wxyz, heading_sigma_rad)
 
     def flush(self) -> list[SolvedPose]:
         """At the end of a recording: the poses that still wait for a camera."""

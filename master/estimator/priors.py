@@ -32,7 +32,7 @@ from common.errors import CalibrationError, FitError
 from common.hand.model import FINGERS, HandModel
 from common.hand.profiles import ABDUCTION, FLEXION, preset_couplings
 from common.kernels import kernel
-from common.records import boxed
+from common.records import boxed, record
 from master.estimator.finger_surface import OWN_MOVES, Surface, laser_centroid, look
 from master.estimator.parameters import HandParameters, HandTables
 from master.estimator.sensors import Device, flexed_palm
@@ -94,12 +94,8 @@ def curled(parameters: HandParameters, settings: Settings, fingers: Bool) -> tup
     """Return inverse variances and means (n,) of fingers (5,) curled out of sight."""
     angles, sigma = np.zeros((5, 4)), np.full((5, 4), np.inf)
     s = settings
-    angles[0] = (
-        s.curled_thumb_abduction_rad,
-        s.curled_thumb_flexion_rad,
-        s.curled_thumb_mcp_rad,
-        s.curled_thumb_ip_rad,
-    )
+    angles[0, :2] = s.curled_thumb_abduction_rad, s.curled_thumb_flexion_rad
+    angles[0, 2:] = s.curled_thumb_mcp_rad, s.curled_thumb_ip_rad
     sigma[0] = settings.curled_rad
     angles[1:, 1:3] = settings.curled_flexion_rad, settings.curled_pip_rad
     sigma[1:, 1:3] = settings.curled_rad
@@ -131,12 +127,9 @@ def _natural_rows(model: HandModel, s: Settings, unlike: frozenset[int]) -> list
 
 def _posture_rows(mean: Float, cov: Float, wider: float) -> list[Row]:
     """How this person holds the fingers, where that was measured: whitened rows."""
-    rows: list[Row] = []
     factor = np.linalg.cholesky(np.linalg.inv(cov)).astype(np.float64)
-    for k in range(20):
-        row = factor[:, k]
-        rows.append(({a: float(row[a]) for a in range(20)}, float(row @ mean), wider))
-    return rows
+    rows: list[Float] = list(factor.T)
+    return [(dict(enumerate(map(float, row))), float(row @ mean), wider) for row in rows]
 
 
 def _free_rows(model: HandModel, s: Settings) -> list[Row]:
@@ -190,17 +183,14 @@ def principal_line(points_m: Float) -> FingerLine:
     if len(points) < min_points:
         raise FitError(f"finger line: {len(points)} points of the laser, at least {min_points} are needed")
     mean = points.mean(axis=0)
-    direction = np.linalg.svd(points - mean, full_matrices=False)[2][0]
-    along = (points - mean) @ direction
+    off = points - mean
+    direction = np.linalg.svd(off, full_matrices=False)[2][0]
+    along = off @ direction
     ends = mean + np.array([[along.min()], [along.max()]]) * direction
     distance = np.linalg.norm(ends, axis=1)
     if distance[0] < distance[1]:  # a bending finger's point comes nearer to the camera
         direction, along = -direction, -along
-    residual = float(
-        np.sqrt(
-            (((points - mean) - ((points - mean) @ direction)[:, None] * direction) ** 2).sum(axis=1).mean()
-        )
-    )
+    residual = float(np.sqrt(((off - along[:, None] * direction) ** 2).sum(axis=1).mean()))
     low, high = float(along.min()), float(along.max())
     min_range_m = 5e-3  # below this the direction is that of the noise
     if high - low < min_range_m:
@@ -213,9 +203,8 @@ def principal_line(points_m: Float) -> FingerLine:
             f"finger line: the points deviate {1e3 * residual:.1f} mm from a line of {1e3 * (high - low):.1f} mm:"
             " only this finger should move"
         )
-    origin = mean + low * direction
     return FingerLine(
-        origin_m=as_vector(origin),
+        origin_m=as_vector(mean + low * direction),
         direction=as_vector(direction),
         range_m=(0.0, high - low),
         residual_m=residual,
@@ -318,7 +307,7 @@ def _curl(setup: WristSetup, synergy: FlexionSynergy) -> Float:
     angles = synergy.angles(curl, np.zeros_like(curl)).reshape(curls, 20)
     points = np.empty((curls, 5, 3))
     tables = HandTables.of(model, HandParameters.of(model))
-    _laser_points(boxed(tables), boxed(Device.of(setup)), angles, boxed(Surface.empty()), points)
+    _laser_points(boxed(tables), boxed(Device.of(setup)), angles, boxed(record(Surface)), points)
     return points
 
 
@@ -357,7 +346,6 @@ class WristModel:
     tilt_rad: float  # by which the IMU may have the vertical off
     heading_rad: float | None  # by which its heading may be off in the beginning; None: it may be any
     natural_only: bool  # whether fingers are taken to bend naturally, whatever is seen
-    cubic: CubicLaw | None  # the paper's law; None: the hand's own bones count
 
     @classmethod
     def of(cls, setup: WristSetup, *, loose: bool) -> "WristModel":
@@ -394,7 +382,6 @@ class WristModel:
             0.0 if setup.imu is None else setup.imu.orientation_sigma_rad,
             None if setup.imu is None else setup.imu.heading_sigma_rad,
             setup.solver_mode == "fk",
-            CubicLaw(setup) if setup.cubic else None,
         )
 
 

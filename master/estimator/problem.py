@@ -29,10 +29,11 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.kernels import inlined, inner, kernel
-from common.records import record
+from common.records import array, part
 from master.estimator.finger_surface import MOVES, Surface, look
 from master.estimator.kinematics import Scratch, rotation_between
 from master.estimator.parameters import HandTables, Mounts
+from master.estimator.priors import PosturePrior
 from master.estimator.sensors import (
     LED_SCALE,
     TILT,
@@ -43,6 +44,7 @@ from master.estimator.sensors import (
     flexed_palm,
     project,
 )
+from master.estimator.settings import Settings
 from master.fabrik.linear_algebra import inverse_3
 
 
@@ -50,6 +52,7 @@ class Rig(NamedTuple):
     """Everything that is the same at every epoch."""
 
     hand: HandTables
+    settings: Settings
     mounts: Mounts
     cameras: CameraArrays
     device: Device
@@ -58,110 +61,69 @@ class Rig(NamedTuple):
 class EpochPrior:
     """Prior at one epoch beside the posture prior, filled in place."""
 
-    own_w2: Float  # (n,) inverse variances, and `own` means, of single angles, by this epoch
-    own: Float
-    past_w2: Float  # (n,) the same, by the state before
-    past: Float
-    palm: Float  # (4, 4) the palm by the state before
-    palm_w2: Float  # (6,) inverse variances of turn [rad] and shift [m] from there; 0: no prior
-    line_of_sight: Float  # (3,) unit vector along which depth is held
-    depth_w2: Float  # (1,) how firmly [1/m^2]
-    back_normal: Float  # (3,) unit vector along which the back looks
-    back_normal_w2: Float
-    z: Float  # (K,) mean of the extras (`master.estimator.sensors`)
-    z_info: Float  # (K, K) their information
-    orientation_info: Float  # (3, 3) [1/rad^2] information of the measured orientation, rig axes
-    oriented: Float  # (1,) whether there is any
-    forearm: Float  # (4, 4) the palm by these in its first rows and columns; `on_forearm`: a straight wrist's
-    on_forearm: Float
-    axes: Float  # (3, 3) rows, rig axes, about which tilt and heading turn a forearm
-    place: Float  # (3,) [m] where the palm is
-    place_w2: Float  # (1,) how firmly; 0: not known
-    lines_of_sight: LinesOfSight
+    own_w2: Float = array("n")  # inverse variances, and `own` means, of single angles, by this epoch
+    own: Float = array("n")
+    past_w2: Float = array("n")  # the same, by the state before
+    past: Float = array("n")
+    palm: Float = array(4, 4)  # the palm by the state before
+    palm_w2: Float = array(6)  # inverse variances of turn [rad] and shift [m] from there; 0: no prior
+    line_of_sight: Float = array(3)  # unit vector along which depth is held
+    depth_w2: Float = array(1)  # how firmly [1/m^2]
+    back_normal: Float = array(3)  # unit vector along which the back looks
+    back_normal_w2: Float = array(1)
+    z: Float = array("K")  # mean of the extras (`master.estimator.sensors`)
+    z_info: Float = array("K", "K")  # their information
+    orientation_info: Float = array(3, 3)  # [1/rad^2] information of the measured orientation, rig axes
+    oriented: Float = array(1)  # whether there is any
+    forearm: Float = array(
+        4, 4
+    )  # the palm by these in its first rows and columns; `on_forearm`: a straight wrist's
+    on_forearm: Float = array(1)
+    axes: Float = array(3, 3)  # rows, rig axes, about which tilt and heading turn a forearm
+    place: Float = array(3)  # [m] where the palm is
+    place_w2: Float = array(1)  # how firmly; 0: not known
+    lines_of_sight: LinesOfSight = part(LinesOfSight)
 
-    @classmethod
-    def none(cls, n: int, extras: int) -> "EpochPrior":
-        """Return an empty prior of a hand with n free angles and so many extras."""
-        return record(
-            cls,
-            **dict.fromkeys(("own_w2", "own", "past_w2", "past"), n),
-            **dict.fromkeys(("line_of_sight", "back_normal", "place"), 3),
-            **dict.fromkeys(("depth_w2", "back_normal_w2", "oriented", "on_forearm", "place_w2"), 1),
-            palm=(4, 4),
-            forearm=(4, 4),
-            palm_w2=6,
-            z=extras,
-            z_info=(extras, extras),
-            orientation_info=(3, 3),
-            axes=(3, 3),
-            lines_of_sight=LinesOfSight.empty(),
-        )
+
+class Iterate:
+    """A hand of N = 6 + n + K unknowns in a search, and the normal equations there."""
+
+    palm: Float = array(4, 4)
+    x: Float = array("n")  # free angles
+    z: Float = array("K")  # extras
+    gradient: Float = array("N")
+    normal: Float = array("N", "N")
 
 
 class Search:
-    """Scratch for a search of N = 6 + n + K unknowns: palm, free angles, extras."""
+    """Scratch for a search."""
 
-    gradient: Float  # (N,)
-    normal: Float  # (N, N)
-    damped: Float  # (N, N)
-    L: Float  # (N, N)
-    step: Float  # (N,)
-    down: Float  # (N,)
-    palm: Float  # (4, 4)
-    next_palm: Float  # (4, 4)
-    x: Float  # (n,)
-    off: Float  # (6,)
-    z: Float  # (K,)
-    q: Float  # (3,)
-    J: Float  # (3, 3)
-    palm_straight: Float  # (4, 4)
-    extras_jacobian: Float  # (5, 3)
-    by_rotation: Float  # (8, 3)
-    palm_camera: Float  # (4, 4)
-    wrist_axes: Float  # (2, 3)
-    twist: Float  # (5,)
-    wrist_share: Float  # (1,) as of `Settings`
-    local_J: Float  # (3, 8)
-    local_r: Float  # (3,)
-    local_w: Float  # (3,)
-    at: Int  # (8,)
-    surface: Surface
-    held: Bool  # (N,)
-    marker_chi2: Float  # (M,)
-    information: Float  # (M, 3, 3)
-    outliers: Float  # (1,)
-    rows: Scratch
-
-    @classmethod
-    def empty(cls, n: int, extras: int, markers: int) -> "Search":
-        """Allocate it."""
-        N = 6 + n + extras
-        scratch = record(
-            cls,
-            **dict.fromkeys(("gradient", "step", "down"), N),
-            **dict.fromkeys(("normal", "damped", "L"), (N, N)),
-            **dict.fromkeys(("palm", "next_palm", "palm_straight", "palm_camera"), (4, 4)),
-            **dict.fromkeys(("q", "local_r", "local_w"), 3),
-            x=n,
-            off=6,
-            z=extras,
-            J=(3, 3),
-            extras_jacobian=(5, 3),
-            by_rotation=(8, 3),
-            wrist_axes=(2, 3),
-            twist=5,
-            wrist_share=1,
-            outliers=1,
-            local_J=(3, 8),
-            at=("i8", 8),
-            surface=Surface.empty(),
-            held=("u1", N),
-            marker_chi2=markers,
-            information=(markers, 3, 3),
-            rows=Scratch.empty(),
-        )
-        scratch.wrist_share[0] = 1.0
-        return scratch
+    trial: Iterate = part(Iterate)
+    damped: Float = array("N", "N")
+    L: Float = array("N", "N")
+    step: Float = array("N")
+    down: Float = array("N")
+    palm: Float = array(4, 4)
+    off: Float = array(6)
+    q: Float = array(3)
+    J: Float = array(3, 3)
+    palm_straight: Float = array(4, 4)
+    extras_jacobian: Float = array(5, 3)
+    by_rotation: Float = array(8, 3)
+    palm_camera: Float = array(4, 4)
+    wrist_axes: Float = array(2, 3)
+    twist: Float = array(5)
+    wrist_share: Float = array(1)  # as of `Settings`
+    local_J: Float = array(3, 8)
+    local_r: Float = array(3)
+    local_w: Float = array(3)
+    column: Int = array(8, kind="i8")  # unknowns of the rows of a finger
+    surface: Surface = part(Surface)
+    held: Bool = array("N", kind="u1")
+    marker_chi2: Float = array("M")
+    information: Float = array("M", 3, 3)
+    outliers: Float = array(1)
+    rows: Scratch = part(Scratch)
 
 
 class Observations(NamedTuple):
@@ -189,6 +151,15 @@ class Observations(NamedTuple):
             np.zeros(markers, np.bool_),
             np.zeros(markers, np.int64),
         )
+
+
+class Problem(NamedTuple):
+    """What a search minimises."""
+
+    rig: Rig
+    posture_prior: PosturePrior
+    epoch_prior: EpochPrior
+    observed: Observations
 
 
 @inlined
@@ -364,14 +335,12 @@ def contrary(epoch_prior: EpochPrior, T: Float, z: Float, search: Search) -> flo
 
 
 @inner
-def orientation_row(
-    epoch_prior: EpochPrior, T: Float, z: Float, n: int, gradient: Float, normal: Float, search: Search
-) -> float:
+def orientation_row(epoch_prior: EpochPrior, at: Iterate, search: Search) -> float:
     """Add the TURN row; return its cost."""
-    J, q, extras_jacobian = search.J, search.q, search.extras_jacobian
+    J, q, extras_jacobian, n = search.J, search.q, search.extras_jacobian, at.x.shape[0]
     K = 5 if epoch_prior.on_forearm[0] > 0.0 else 0
-    sensed_palm(epoch_prior, z, search)
-    rotation_between(T, search.palm, J, q)
+    sensed_palm(epoch_prior, at.z, search)
+    rotation_between(at.palm, search.palm, J, q)
     rotation_vector_jacobian(q, J)
     L, w = epoch_prior.orientation_info, search.off
     cost = 0.0
@@ -392,14 +361,14 @@ def orientation_row(
             )
     for a in range(3 + K):
         ia = a if a < 3 else _column(n, a - 3)
-        gradient[ia] += D[a, 0] * w[0] + D[a, 1] * w[1] + D[a, 2] * w[2]
+        at.gradient[ia] += D[a, 0] * w[0] + D[a, 1] * w[1] + D[a, 2] * w[2]
         for b in range(3 + K):
             ib = b if b < 3 else _column(n, b - 3)
             total = 0.0
             for i in range(3):
                 for j in range(3):
                     total += D[a, i] * L[i, j] * D[b, j]
-            normal[ia, ib] += total
+            at.normal[ia, ib] += total
     return cost
 
 
@@ -422,29 +391,16 @@ def rotate_by_vector(rotation: Float, R: Float, out: Float) -> None:
 
 
 @inner
-def finger_rows(
-    rig: Rig,
-    epoch_prior: EpochPrior,
-    f: int,
-    z: Float,
-    n: int,
-    gradient: Float,
-    normal: Float,
-    search: Search,
-) -> float:
+def finger_rows(rig: Rig, epoch_prior: EpochPrior, f: int, at: Iterate, search: Search) -> float:
     """Add the rows of finger f at `search.rows.angles`; return their cost."""
     hand, lines_of_sight, work, surface = rig.hand, epoch_prior.lines_of_sight, search.rows, search.surface
     start = hand.first[f]
-    count, base = hand.first[f + 1] - start, 6 + n
-    J, r, w, at = search.local_J, search.local_r, search.local_w, search.at
+    count, base = hand.first[f + 1] - start, 6 + at.x.shape[0]
+    J, r, w, column = search.local_J, search.local_r, search.local_w, search.column
     for c in range(count):
-        at[c] = 6 + start + c
-    at[count], at[count + 1], at[count + 2], at[count + 3] = (
-        base + f,
-        base + WRIST_ANGLES,
-        base + WRIST_ANGLES + 1,
-        base + LED_SCALE,
-    )
+        column[c] = 6 + start + c
+    column[count], column[count + 1] = base + f, base + WRIST_ANGLES
+    column[count + 2], column[count + 3] = base + WRIST_ANGLES + 1, base + LED_SCALE
     size, cost = count + 4, 0.0
     if lines_of_sight.lit[f] == 0.0 and lines_of_sight.shown[f] == 0.0:
         return 0.0
@@ -459,13 +415,11 @@ def finger_rows(
             r[1] = surface.seen[1] + lines_of_sight.lack[f, 1] - lines_of_sight.laser[f, 1]
         else:
             W, first = lines_of_sight.tip_W[f], 2
-            r[0], r[1] = (
-                surface.seen[2] - lines_of_sight.tip[f, 0],
-                surface.seen[3] - lines_of_sight.tip[f, 1],
-            )
+            r[0] = surface.seen[2] - lines_of_sight.tip[f, 0]
+            r[1] = surface.seen[3] - lines_of_sight.tip[f, 1]
             if lines_of_sight.depth_w2[f] > 0.0:
                 rows = 3
-                r[2] = surface.seen[4] + z[LED_SCALE] - lines_of_sight.depth[f]
+                r[2] = surface.seen[4] + at.z[LED_SCALE] - lines_of_sight.depth[f]
         for i in range(rows):
             for c in range(count):
                 J[i, c] = 0.0
@@ -486,7 +440,7 @@ def finger_rows(
             of_wrist = a == count + 1 or a == count + 2
             share = search.wrist_share[0] if of_wrist else 1.0
             for i in range(rows):
-                gradient[at[a]] += share * J[i, a] * w[i]
+                at.gradient[column[a]] += share * J[i, a] * w[i]
             p0 = W[0, 0] * J[0, a] + W[0, 1] * J[1, a]
             p1 = W[1, 0] * J[0, a] + W[1, 1] * J[1, a]
             p2 = lines_of_sight.depth_w2[f] * J[2, a] if rows == 3 else 0.0
@@ -496,5 +450,5 @@ def finger_rows(
                     total += p2 * J[2, b]
                 if b == count + 1 or b == count + 2 or of_wrist:
                     total *= search.wrist_share[0]
-                normal[at[a], at[b]] += total
+                at.normal[column[a], column[b]] += total
     return cost

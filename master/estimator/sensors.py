@@ -23,7 +23,7 @@ from common.geometry.transforms import intersect_plane
 from common.hand.model import Fingertips
 from common.hand.skin import PLACES, SPREAD, PalmarSurface
 from common.kernels import inlined, inner, kernel
-from common.records import filled, record
+from common.records import array, filled, record
 from master.rig.wrist import WristSetup
 
 
@@ -55,41 +55,49 @@ class CameraArrays(NamedTuple):
 
 
 @inlined
+def _through_lens(
+    cameras: CameraArrays, c: int, x: float, y: float
+) -> tuple[float, float, float, float, float, float]:
+    """Return where the lens of camera c shows a normalised point, and derivatives.
+
+    x, y; the derivatives of x by x, of x by y and y by x, of y by y; and the radial factor.
+    """
+    D = cameras.distortion[c]
+    k1, k2, p1, p2, k3 = D[0], D[1], D[2], D[3], D[4]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    radial_derivative = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))  # of radial, by r^2, twice
+    return (
+        x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+        y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+        radial + radial_derivative * x * x + 2.0 * p1 * y + 6.0 * p2 * x,
+        radial_derivative * x * y + 2.0 * (p1 * x + p2 * y),
+        radial + radial_derivative * y * y + 6.0 * p1 * y + 2.0 * p2 * x,
+        radial,
+    )
+
+
+@inlined
 def project(cameras: CameraArrays, c: int, point: Float, uv: Float, J: Float) -> bool:
     """Write where camera c sees a point (3,) [m], rig frame, and J (2, 3) [px/m].
 
     `uv` (2,) [px], distorted image. False: the point is behind the camera, nothing is written.
     """
-    x = cameras.t[c, 0]
-    y = cameras.t[c, 1]
-    z = cameras.t[c, 2]
+    R, x, y, z = cameras.R[c], cameras.t[c, 0], cameras.t[c, 1], cameras.t[c, 2]
     for i in range(3):
-        x += cameras.R[c, 0, i] * point[i]
-        y += cameras.R[c, 1, i] * point[i]
-        z += cameras.R[c, 2, i] * point[i]
+        x += R[0, i] * point[i]
+        y += R[1, i] * point[i]
+        z += R[2, i] * point[i]
     least_depth_m = 1e-9
     if not z > least_depth_m:
         return False
     x, y = x / z, y / z
-    k1, k2, p1, p2, k3 = (
-        cameras.distortion[c, 0],
-        cameras.distortion[c, 1],
-        cameras.distortion[c, 2],
-        cameras.distortion[c, 3],
-        cameras.distortion[c, 4],
-    )
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    radial_derivative = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))  # of radial, by r^2, twice
     fx, fy = cameras.focal[c, 0], cameras.focal[c, 1]
-    uv[0] = fx * (x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)) + cameras.principal[c, 0]
-    uv[1] = fy * (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y) + cameras.principal[c, 1]
-    a = radial + radial_derivative * x * x + 2.0 * p1 * y + 6.0 * p2 * x
-    b = radial_derivative * x * y + 2.0 * (p1 * x + p2 * y)
-    d = radial + radial_derivative * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+    u, v, a, b, d, _ = _through_lens(cameras, c, x, y)
+    uv[0], uv[1] = fx * u + cameras.principal[c, 0], fy * v + cameras.principal[c, 1]
     for i in range(3):
-        by_x = (cameras.R[c, 0, i] - x * cameras.R[c, 2, i]) / z
-        by_y = (cameras.R[c, 1, i] - y * cameras.R[c, 2, i]) / z
+        by_x = (R[0, i] - x * R[2, i]) / z
+        by_y = (R[1, i] - y * R[2, i]) / z
         J[0, i] = fx * (a * by_x + b * by_y)
         J[1, i] = fy * (b * by_x + d * by_y)
     return True
@@ -98,26 +106,13 @@ def project(cameras: CameraArrays, c: int, point: Float, uv: Float, J: Float) ->
 @inlined
 def undistort(cameras: CameraArrays, c: int, u: float, v: float, out: Float) -> bool:
     """Write a pixel's normalised point (2,), by Newton; False: the lens folds there."""
-    k1, k2, p1, p2, k3 = (
-        cameras.distortion[c, 0],
-        cameras.distortion[c, 1],
-        cameras.distortion[c, 2],
-        cameras.distortion[c, 3],
-        cameras.distortion[c, 4],
-    )
     seen_x = (u - cameras.principal[c, 0]) / cameras.focal[c, 0]
     seen_y = (v - cameras.principal[c, 1]) / cameras.focal[c, 1]
     x, y = seen_x, seen_y
     newton_steps = 12
     for _ in range(newton_steps):
-        r2 = x * x + y * y
-        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        radial_derivative = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))
-        off_x = seen_x - (x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x))
-        off_y = seen_y - (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y)
-        a = radial + radial_derivative * x * x + 2.0 * p1 * y + 6.0 * p2 * x
-        b = radial_derivative * x * y + 2.0 * (p1 * x + p2 * y)
-        d = radial + radial_derivative * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+        there_x, there_y, a, b, d, radial = _through_lens(cameras, c, x, y)
+        off_x, off_y = seen_x - there_x, seen_y - there_y
         determinant = a * d - b * b
         step_x = (d * off_x - b * off_y) / determinant
         step_y = (a * off_y - b * off_x) / determinant
@@ -196,19 +191,19 @@ _PALM_M = 7e-4  # what calibration leaves of plane and palm: a palm pitched by 0
 class Device:
     """Geometry of a wrist device mounted before its hand [m], camera frame."""
 
-    palm: Float  # (4, 4) that of a straight wrist
-    laser_m: Float  # (3,) where the laser's light comes from, in its plane
-    plane: Float  # (3, 3) unit vectors across and along the plane, and its normal
-    offset: Float  # (1,) the plane is normal . X = offset
-    focal: Float  # (1,) [px]
-    before: Float  # (1,) on which side of the plane the wrist lies, 1 or -1
-    radius: Float  # (5, 8) of the spheres of the skin, finger by sphere
-    deep: Float  # (5, 8) how far behind the bone their centres lie, dorsally
-    local: Float  # (5, 8, 3) their centres in the frames of their bones' joints
-    back: Float  # (5, 3, 3) unit vectors towards the back of each bone, in the frame of its joint
-    tip: Float  # (5, 3) fingertip in the frame of the last joint but the tip
-    surface2: Float  # (5,) [m^2] variance of the skin's distance from the bone
-    tip2: Float  # (5,) [m^2] variance of where the skin ends
+    palm: Float = array(4, 4)  # that of a straight wrist
+    laser_m: Float = array(3)  # where the laser's light comes from, in its plane
+    plane: Float = array(3, 3)  # unit vectors across and along the plane, and its normal
+    offset: Float = array(1)  # the plane is normal . X = offset
+    focal: Float = array(1)  # [px]
+    before: Float = array(1)  # on which side of the plane the wrist lies, 1 or -1
+    radius: Float = array(5, 8)  # of the spheres of the skin, finger by sphere
+    deep: Float = array(5, 8)  # how far behind the bone their centres lie, dorsally
+    local: Float = array(5, 8, 3)  # their centres in the frames of their bones' joints
+    back: Float = array(5, 3, 3)  # unit vectors towards the back of each bone, in the frame of its joint
+    tip: Float = array(5, 3)  # fingertip in the frame of the last joint but the tip
+    surface2: Float = array(5)  # [m^2] variance of the skin's distance from the bone
+    tip2: Float = array(5)  # [m^2] variance of where the skin ends
 
     @classmethod
     def of(cls, setup: WristSetup) -> "Device":
@@ -227,74 +222,41 @@ class Device:
                 local[f, k] = share * model.bone_m[f, b] + deep[f, k] * back[f, b]
         last = model.bone_m[:, 2]
         length = np.linalg.norm(last, axis=1)
-        side = np.sign(setup.normal @ setup.T_camera_palm[:3, 3] - setup.offset_m)
         return filled(
-            cls,
-            {
-                "palm": setup.T_camera_palm,
-                "laser_m": np.asarray(setup.laser_m, np.float64),
-                "plane": np.concatenate([axes.axes, setup.normal[None]]),
-                "offset": np.array([setup.offset_m]),
-                "focal": np.array([setup.optics.matrix[0, 0]]),
-                "before": np.array([side]),
-                "radius": surface.radius_m,
-                "deep": deep,
-                "local": local,
-                "back": back,
-                "tip": last * (1.0 + tips.beyond_m / length)[:, None] + tips.dorsal_m * back[:, 2],
-                "surface2": (SPREAD * surface.palmar_m.mean(axis=1)) ** 2,
-                "tip2": (SPREAD * tips.beyond_m) ** 2 + _PALM_M**2,
-            },
-        )
-
-    @classmethod
-    def none(cls) -> "Device":
-        """Scratch of the same shape, of a rig without wrist device."""
-        return record(
-            cls,
-            **dict.fromkeys(("offset", "focal", "before"), 1),
-            palm=(4, 4),
-            laser_m=3,
-            plane=(3, 3),
-            radius=(5, 8),
-            deep=(5, 8),
-            local=(5, 8, 3),
-            back=(5, 3, 3),
-            tip=(5, 3),
-            surface2=5,
-            tip2=5,
+            record(cls),
+            palm=setup.T_camera_palm,
+            laser_m=setup.laser_m,
+            plane=np.concatenate([axes.axes, setup.normal[None]]),
+            offset=setup.offset_m,
+            focal=setup.optics.matrix[0, 0],
+            before=np.sign(setup.normal @ setup.T_camera_palm[:3, 3] - setup.offset_m),
+            radius=surface.radius_m,
+            deep=deep,
+            local=local,
+            back=back,
+            tip=last * (1.0 + tips.beyond_m / length)[:, None] + tips.dorsal_m * back[:, 2],
+            surface2=(SPREAD * surface.palmar_m.mean(axis=1)) ** 2,
+            tip2=(SPREAD * tips.beyond_m) ** 2 + _PALM_M**2,
         )
 
 
 class LinesOfSight:
     """What one strobe cycle shows of five fingers, as rows; rays are (x, y, 1)."""
 
-    lit: Float  # (5,) 1 where a laser point is a row, and `shown` where a fingertip is
-    shown: Float
-    laser: Float  # (5, 2) laser points x, y, and `laser_W` (5, 2, 2) their information
-    laser_W: Float
-    lack: Float  # (5, 2) x, y that the ridge lacks there to the exact cut (`finger_surface`)
-    laser_px: Float  # (5,) length of the line [px]; 0: not known
-    tip: Float  # (5, 2) fingertips x, y, and `tip_W` (5, 2, 2) their information
-    tip_W: Float
-    depth: Float  # (5,) logarithm of their distance by light, in a unit of its own
-    depth_w2: Float  # (5,) how sure; 0: none
-    teaches: Float  # (5,) 1 where a finger constrains how its hinges are rolled
-    laser_s: Float  # (1,) how much later than the epoch the laser points were seen, as `tip_s` the tips
-    tip_s: Float
-    rows: Float  # (1,) whether there is any row
-
-    @classmethod
-    def empty(cls) -> "LinesOfSight":
-        """Nothing is seen."""
-        return record(
-            cls,
-            **dict.fromkeys(("lit", "shown", "laser_px", "depth", "depth_w2", "teaches"), 5),
-            **dict.fromkeys(("laser", "lack", "tip"), (5, 2)),
-            **dict.fromkeys(("laser_s", "tip_s", "rows"), 1),
-            laser_W=(5, 2, 2),
-            tip_W=(5, 2, 2),
-        )
+    lit: Float = array(5)  # 1 where a laser point is a row, and `shown` where a fingertip is
+    shown: Float = array(5)
+    laser: Float = array(5, 2)  # laser points x, y, and `laser_W` (5, 2, 2) their information
+    laser_W: Float = array(5, 2, 2)
+    lack: Float = array(5, 2)  # x, y that the ridge lacks there to the exact cut (`finger_surface`)
+    laser_px: Float = array(5)  # length of the line [px]; 0: not known
+    tip: Float = array(5, 2)  # fingertips x, y, and `tip_W` (5, 2, 2) their information
+    tip_W: Float = array(5, 2, 2)
+    depth: Float = array(5)  # logarithm of their distance by light, in a unit of its own
+    depth_w2: Float = array(5)  # how sure; 0: none
+    teaches: Float = array(5)  # 1 where a finger constrains how its hinges are rolled
+    laser_s: Float = array(1)  # how much later than the epoch the laser points were seen, as `tip_s` the tips
+    tip_s: Float = array(1)
+    rows: Float = array(1)  # whether there is any row
 
 
 @inlined
@@ -304,14 +266,20 @@ def inverse_2(a: float, b: float, c: float, out: Float) -> None:
     out[0, 0], out[0, 1], out[1, 0], out[1, 1] = c * scale, -b * scale, -b * scale, a * scale
 
 
+@inlined
+def _covariance(W: Float) -> tuple[float, float, float]:
+    """Return a, b, c of the inverse (a, b; b, c) of information W (2, 2)."""
+    det = W[0, 0] * W[1, 1] - W[0, 1] * W[1, 0]
+    return W[1, 1] / det, -W[0, 1] / det, W[0, 0] / det
+
+
 @inner
 def loosen(W: Float, J: Float, row: int, cov: Float) -> None:
     """Reduce the information W (2, 2) of two rows by the uncertain wrist flexion.
 
     `J` (5, 7): derivatives by the bend last; `row`: the first of the two; `cov` (K, K) of the extras.
     """
-    det = W[0, 0] * W[1, 1] - W[0, 1] * W[1, 0]
-    a, b, c = W[1, 1] / det, -W[0, 1] / det, W[0, 0] / det
+    a, b, c = _covariance(W)
     for i in range(2):
         for j in range(2):
             p = cov[WRIST_ANGLES + i, WRIST_ANGLES + j]
@@ -335,8 +303,7 @@ def loosen_short(
     if seen_px == 0.0 or seen_px > whole * length_px or not on_plane(device, x, y, point, A):
         return False
     W = lines_of_sight.laser_W[f]
-    det = W[0, 0] * W[1, 1] - W[0, 1] * W[1, 0]
-    a, b, c = W[1, 1] / det, -W[0, 1] / det, W[0, 0] / det
+    a, b, c = _covariance(W)
     off = 0.5 * (length_px - seen_px) / device.focal[0]
     for axis in range(2):
         curved = 1.0 / 3.0  # of how far a centroid is off across: as far it is off along
@@ -362,27 +329,30 @@ def on_plane(device: Any, x: float, y: float, out: Float, A: Float) -> bool:
     return True
 
 
+class WristRows(NamedTuple):
+    """Measurements of five fingers from one strobe cycle; rays are (x, y, 1)."""
+
+    laser: Float  # (5, 2) x, y, as `tip`; NaN: not seen
+    laser_sigma_px: Float  # (5,) standard deviation per axis, as `tip_sigma_px`
+    laser_px: Float  # (5,) lengths of the lines
+    tip: Float
+    tip_sigma_px: Float
+    tip_depth: Float  # (5,) distances of the tips by light, in a unit of its own
+    laser_s: float  # how much later than the epoch the laser points were seen, as `tip_s` the fingertips
+    tip_s: float
+    law: Float  # (5,) PIPs [rad] by another law of the laser point; NaN: none
+
+
 @kernel
-def observe_wrist(
-    boxed_device: Any,
-    laser: Float,
-    laser_sigma_px: Float,
-    laser_px: Float,
-    tip: Float,
-    tip_sigma_px: Float,
-    tip_depth: Float,
-    depth_sigma: float,
-    laser_s: float,
-    tip_s: float,
-    boxed_out: Any,
-) -> None:
-    """Write the rows of a strobe cycle, with arguments as of `WristRows`.
+def observe_wrist(boxed_device: Any, seen: WristRows, depth_sigma: float, boxed_out: Any) -> None:
+    """Write the rows of a strobe cycle into `boxed_out`, (1,) `LinesOfSight`.
 
     `depth_sigma`: standard deviation of the logarithms of `tip_depth`; 0: they are not used.
     """
+    laser, laser_sigma_px, tip, tip_sigma_px = seen.laser, seen.laser_sigma_px, seen.tip, seen.tip_sigma_px
     device, out = boxed_device[0], boxed_out[0]
     point, A = np.zeros(3), np.zeros((2, 2))
-    out.rows[0], out.laser_s[0], out.tip_s[0] = 0.0, laser_s, tip_s
+    out.rows[0], out.laser_s[0], out.tip_s[0] = 0.0, seen.laser_s, seen.tip_s
     for f in range(5):
         out.lit[f] = out.shown[f] = out.depth_w2[f] = out.laser_px[f] = 0.0
         out.lack[f, 0] = out.lack[f, 1] = 0.0
@@ -400,7 +370,7 @@ def observe_wrist(
             c = sensed + A[1, 0] ** 2 * across + A[1, 1] ** 2 * along
             inverse_2(a, b, c, out.laser_W[f])
             out.laser[f, 0], out.laser[f, 1], out.lit[f], out.rows[0] = x, y, 1.0, 1.0
-            out.laser_px[f] = laser_px[f] if laser_px[f] > 0.0 else 0.0
+            out.laser_px[f] = seen.laser_px[f] if seen.laser_px[f] > 0.0 else 0.0
         x, y = tip[f, 0], tip[f, 1]
         if np.isfinite(x + y + tip_sigma_px[f]):
             away_m = 0.1  # a fingertip of which no laser point measures the distance
@@ -408,8 +378,8 @@ def observe_wrist(
             variance = (tip_sigma_px[f] / device.focal[0]) ** 2 + device.tip2[f] / near**2
             inverse_2(variance, 0.0, variance, out.tip_W[f])
             out.tip[f, 0], out.tip[f, 1], out.shown[f], out.rows[0] = x, y, 1.0, 1.0
-            if depth_sigma > 0.0 and tip_depth[f] > 0.0:
-                out.depth[f], out.depth_w2[f] = log(tip_depth[f]), 1.0 / depth_sigma**2
+            if depth_sigma > 0.0 and seen.tip_depth[f] > 0.0:
+                out.depth[f], out.depth_w2[f] = log(seen.tip_depth[f]), 1.0 / depth_sigma**2
 
 
 @inner

@@ -32,7 +32,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.hand.model import CHAINS, MIDDLE_PROXIMAL, TIPS, HandJoints, HandModel
 from common.kernels import bound, constant, inner, kernel
-from common.records import boxed, fields, record
+from common.records import array, boxed, fields, filled, part, record
 from master.estimator.covariance import is_small
 from master.estimator.epoch import Fitted
 from master.estimator.kinematics import (
@@ -126,73 +126,62 @@ class Smoothing:
     The signals are place (3), turn (3), angles (5, 4), all [m].
     """
 
-    t_ns: Int  # (1,) when; NEVER_NS: there is no hand
-    sources: Int  # (6,) what the fingers, and the palm, rested on: `Fitted.sources`
-    values: Float  # (26,) [m] the filtered signals
-    palm: Float  # (4, 4) as filtered
-    offset: Float  # (26,) [m] what was shown less what was solved, when each part was last seen again
-    since_ns: Int  # (6,) when that was
-    until_ns: Int  # (1,) when nothing is left of any
-    count: Int  # with `dt_s`, `past`: the measured noise (`master.fabrik.one_euro.measure`)
-    dt_s: Float
-    past: Float
-    x: Float  # with `speed`, `seen_ns`: the filter (`master.fabrik.one_euro.filter_step`)
-    speed: Float
-    seen_ns: Int
-    filter: Float  # (5,) its settings
-    part: Int  # (26,) finger of each signal, PALM_PART: the palm
-    marker_of: Int  # (5,) marker of each finger; -1: there is none
-    knuckle: Float  # (3,) [m] the place in the palm frame
-    across: Float  # (1,) [m/rad] by how much a turn counts
-    reach: Float  # (20,) [m/rad] the angles
-    dip_per_pip: Float  # (1,) how the DIP follows the PIP
-    blend_s: Float  # (1,) in which leaps fade
-    tracked_m: Float  # (1,) how large the region of a tracked joint may be
-    signals: Float  # (26,) [m] as solved, and what is left of leaps
-    largest: Float  # (26,) room
-    noise: Float  # (26,) room
-    filtered: Float  # (26,) room
-    fastest: Float  # (6, 2) room
-    work: Scratch
+    t_ns: Int = array(1, kind="i8")  # when; NEVER_NS: there is no hand
+    sources: Int = array(6, kind="i8")  # what the fingers, and the palm, rested on: `Fitted.sources`
+    values: Float = array(26)  # [m] the filtered signals
+    palm: Float = array(4, 4)  # as filtered
+    offset: Float = array(26)  # [m] what was shown less what was solved, when each part was last seen again
+    since_ns: Int = array(6, kind="i8")  # when that was
+    until_ns: Int = array(1, kind="i8")  # when nothing is left of any
+    count: Int = array(
+        2, kind="i8"
+    )  # with `dt_s`, `past`: the measured noise (`master.fabrik.one_euro.measure`)
+    dt_s: Float = array(1)
+    past: Float = array(3, 26)
+    x: Float = array(26)  # with `speed`, `seen_ns`: the filter (`master.fabrik.one_euro.filter_step`)
+    speed: Float = array(26)
+    seen_ns: Int = array(26, kind="i8")
+    filter: Float = array(5)  # its settings
+    part_of: Int = array(26, kind="i8")  # finger of each signal, PALM_PART: the palm
+    marker_of: Int = array(5, kind="i8")  # marker of each finger; -1: there is none
+    knuckle: Float = array(3)  # [m] the place in the palm frame
+    across: Float = array(1)  # [m/rad] by how much a turn counts
+    reach: Float = array(20)  # [m/rad] the angles
+    dip_per_pip: Float = array(1)  # how the DIP follows the PIP
+    blend_s: Float = array(1)  # in which leaps fade
+    tracked_m: Float = array(1)  # how large the region of a tracked joint may be
+    signals: Float = array(26)  # [m] as solved, and what is left of leaps
+    largest: Float = array(26)  # room
+    noise: Float = array(26)  # room
+    filtered: Float = array(26)  # room
+    fastest: Float = array(6, 2)  # room
+    step: Float = array(6)  # room: turn, and no shift
+    work: Scratch = part(Scratch)
 
-    @classmethod
-    def of(
-        cls, model: HandModel, markers: tuple[str, ...], parameters: OneEuroParameters, settings: Settings
-    ) -> "Smoothing":
-        """Nothing was shown yet; arguments as of `HandOneEuro`."""
-        out = record(
-            cls,
-            **dict.fromkeys(
-                ("values", "offset", "x", "speed", "signals", "largest", "noise", "filtered"), 26
-            ),
-            **dict.fromkeys(("dt_s", "across", "dip_per_pip", "blend_s", "tracked_m"), 1),
-            **dict.fromkeys(("t_ns", "until_ns"), ("i8", 1)),
-            **dict.fromkeys(("sources", "since_ns"), ("i8", 6)),
-            **dict.fromkeys(("part", "seen_ns"), ("i8", 26)),
-            count=("i8", 2),
-            marker_of=("i8", 5),
-            palm=(4, 4),
-            past=(3, 26),
-            filter=5,
-            knuckle=3,
-            reach=20,
-            fastest=(6, 2),
-            work=Scratch.empty(),
-        )
-        rest = model.rest_position_m
-        out.t_ns[:] = out.until_ns[:] = out.since_ns[:] = NEVER_NS
-        out.part[:] = PARTS
-        out.seen_ns[:] = UNSEEN_NS
-        out.filter[:] = parameters.array()
-        fingers = [model.mount(name).finger for name in markers]
-        out.marker_of[:] = [fingers.index(f) if f in fingers else -1 for f in range(5)]
-        out.knuckle[:] = rest[MIDDLE_PROXIMAL]
-        out.across[:] = np.linalg.norm(rest[TIPS[1:]] - out.knuckle, axis=1).mean()
+
+def _begun(
+    model: HandModel, markers: tuple[str, ...], parameters: OneEuroParameters, settings: Settings
+) -> Smoothing:
+    """Nothing was shown yet; arguments as of `HandOneEuro`."""
+    rest, fingers = model.rest_position_m, [model.mount(name).finger for name in markers]
+    knuckle = rest[MIDDLE_PROXIMAL]
+    return filled(
+        record(Smoothing),
+        t_ns=NEVER_NS,
+        until_ns=NEVER_NS,
+        since_ns=NEVER_NS,
+        part_of=PARTS,
+        seen_ns=UNSEEN_NS,
+        filter=parameters.array(),
+        marker_of=[fingers.index(f) if f in fingers else -1 for f in range(5)],
+        knuckle=knuckle,
+        across=np.linalg.norm(rest[TIPS[1:]] - knuckle, axis=1).mean(),
         # The DIP bends with the PIP, so it counts as far.
-        out.reach[:] = np.linalg.norm(rest[TIPS][:, None] - rest[CHAINS[:, [0, 0, 1, 1]]], axis=2).ravel()
-        out.dip_per_pip[:] = model.dip_per_pip or 0.0
-        out.blend_s[:], out.tracked_m[:] = settings.blend_s, settings.tracked_m
-        return out
+        reach=np.linalg.norm(rest[TIPS][:, None] - rest[CHAINS[:, [0, 0, 1, 1]]], axis=2).ravel(),
+        dip_per_pip=model.dip_per_pip or 0.0,
+        blend_s=settings.blend_s,
+        tracked_m=settings.tracked_m,
+    )
 
 
 @inner
@@ -223,7 +212,7 @@ def _blend(state: Smoothing, t_ns: int, sources: Int) -> bool:
     if t_ns >= state.until_ns[0]:
         return False
     for i in range(26):
-        since_ns = state.since_ns[state.part[i]]
+        since_ns = state.since_ns[state.part_of[i]]
         if since_ns == t_ns:
             state.offset[i] = state.values[i] - state.signals[i]
         x = min((t_ns - since_ns) * (1e-9 / blend_s), 1.0)
@@ -246,7 +235,7 @@ def _write_largest(state: Smoothing, sources: Int, cov: Float) -> None:
         place[i] /= max(count, 1)
         rotation += place[i] / 3.0
     for i in range(26):
-        p = state.part[i]
+        p = state.part_of[i]
         state.largest[i] = nan
         if count == 0 or sources[p] == 0:
             continue
@@ -266,7 +255,7 @@ def _filter(state: Smoothing, t_ns: int, sources: Int, marker_cov: Float) -> Non
         state.signals,
         state.noise,
         state.filter,
-        state.part,
+        state.part_of,
         state.fastest,
         state.x,
         state.speed,
@@ -277,10 +266,10 @@ def _filter(state: Smoothing, t_ns: int, sources: Int, marker_cov: Float) -> Non
 
 @inner
 def _write_pose(hand: HandTables, state: Smoothing, shown: Pose) -> None:
-    T, rotation, angles, work = state.work.palm, state.work.g, state.work.angles, state.work
+    T, angles, work = state.work.palm, state.work.angles, state.work
     for i in range(3):
-        rotation[i] = (state.filtered[3 + i] - state.values[3 + i]) / state.across[0]
-    rotate_by(rotation, state.palm, T)
+        state.step[i] = (state.filtered[3 + i] - state.values[3 + i]) / state.across[0]
+    rotate_by(state.step, state.palm, T)
     for i in range(3):
         T[i, 3] = state.filtered[i]
         for j in range(3):
@@ -290,8 +279,8 @@ def _write_pose(hand: HandTables, state: Smoothing, shown: Pose) -> None:
         if a > 3 and a % 4 == 3:
             angles[a] += state.dip_per_pip[0] * angles[a - 1]
     clamp(hand, angles)
-    chains(hand, T, angles, work.R, work.P)
-    joints(hand, T, work.R, work.P, shown.position, shown.rotation)
+    chains(hand, T, work)
+    joints(hand, T, work, shown.position, shown.rotation)
     copy(T, shown.palm)
     for a in range(20):
         shown.angles[a // 4, a % 4] = angles[a]
@@ -372,7 +361,7 @@ class HandOneEuro:
         self._on_palm = Mounts.of(model, markers).on_back
         self._blend_m_s = blend_m_s
         self._blend: Blend | None = None
-        state = Smoothing.of(model, markers, parameters, settings)
+        state = _begun(model, markers, parameters, settings)
         self._t_ns, self._values, self._signals = state.t_ns, state.values, state.signals
         self._state = boxed(state)
         self._fresh = self._state.copy()

@@ -32,7 +32,7 @@ import numpy as np
 
 from common.arrays import Bool, Code, Float, Int
 from common.kernels import constant, inlined, inner
-from common.records import record
+from common.records import array, filled, record
 from master.estimator.kinematics import clamp, free_of
 from master.estimator.parameters import HandTables
 from master.estimator.problem import EpochPrior
@@ -48,89 +48,59 @@ PALM_PART = 5  # behind the five fingers
 class HandState:
     """A hand with n free angles as the last epoch left it."""
 
-    t_ns: Int  # (1,) when
-    known: Bool  # (1,) whether there is a hand
-    seen_ns: Int  # (1,) when anything of it was measured last
-    triangulated_ns: Int  # (1,) when two cameras, or a depth law, placed a marker of it last
-    measured_ns: Int  # (6,) when each finger, and the palm, was measured last
-    palm: Float  # (4, 4)
-    x: Float  # (n,) free angles [rad]
-    angles: Float  # (20,) all angles [rad]
-    rates: Float  # (20,) [rad/s]
-    cov: Float  # (N, N) of turn [rad], shift [m], rig axes, free angles [rad] and extras
-    z: Float  # (K,) mean of the extras, which are filtered
-    z_cov: Float  # (K, K)
-    z_ns: Int  # (1,) when they were stepped last
-    stationary: Float  # (K,) variances to grow to
-    wrist_mean_rad: Float  # (2,) [rad] the bend of the wrist that is kept
-    solver_mode: Code  # (5,) `SolverMode` codes of a finger's last solution by the device; 0: markers since
-    searched: Int  # (5,) strobe cycles since the whole cost map of a finger was searched
-    vague: Bool  # (5,) whether that was not well enough to be tracked
-    coupling: Float  # (3,) sums of what was learnt of MCP and PIP (`master.estimator.wrist_update`)
-    natural_weight: Float  # (1,) probability that it follows the posture prior
-    speed: Float  # (1,) [m/s] of the palm
-    lost_s: Float  # (1,) how long nothing measures where it is
-    hidden_ns: Int  # (5,) when a finger hidden at the last epoch was seen last; NEVER_NS: seen there
-    then: Float  # (5, 20) the angles of the whole hand at that time
-    then_rates: Float  # (5, 20) [rad/s]
-    then_alike: Float  # (5,) how neighbours correlated then
-    measured_rotation: Float  # (3, 3) of the palm by other sensors
-    measured_rotation_known: Bool
+    t_ns: Int = array(1, kind="i8")  # when
+    known: Bool = array(1, kind="u1")  # whether there is a hand
+    seen_ns: Int = array(1, kind="i8")  # when anything of it was measured last
+    triangulated_ns: Int = array(1, kind="i8")  # when two cameras, or a depth law, placed a marker of it last
+    measured_ns: Int = array(6, kind="i8")  # when each finger, and the palm, was measured last
+    palm: Float = array(4, 4)
+    x: Float = array("n")  # free angles [rad]
+    angles: Float = array(20)  # all angles [rad]
+    rates: Float = array(20)  # [rad/s]
+    cov: Float = array("N", "N")  # of turn [rad], shift [m], rig axes, free angles [rad] and extras
+    z: Float = array("K")  # mean of the extras, which are filtered
+    z_cov: Float = array("K", "K")
+    z_ns: Int = array(1, kind="i8")  # when they were stepped last
+    stationary: Float = array("K")  # variances to grow to
+    wrist_mean_rad: Float = array(2)  # [rad] the bend of the wrist that is kept
+    solver_mode: Code = array(
+        5, kind="u1"
+    )  # `SolverMode` codes of a finger's last solution by the device; 0: markers since
+    searched: Int = array(5, kind="i8")  # strobe cycles since the whole cost map of a finger was searched
+    vague: Bool = array(5, kind="u1")  # whether that was not well enough to be tracked
+    coupling: Float = array(3)  # sums of what was learnt of MCP and PIP (`master.estimator.wrist_update`)
+    natural_weight: Float = array(1)  # probability that it follows the posture prior
+    speed: Float = array(1)  # [m/s] of the palm
+    lost_s: Float = array(1)  # how long nothing measures where it is
+    hidden_ns: Int = array(
+        5, kind="i8"
+    )  # when a finger hidden at the last epoch was seen last; NEVER_NS: seen there
+    then: Float = array(5, 20)  # the angles of the whole hand at that time
+    then_rates: Float = array(5, 20)  # [rad/s]
+    then_alike: Float = array(5)  # how neighbours correlated then
+    measured_rotation: Float = array(3, 3)  # of the palm by other sensors
+    measured_rotation_known: Bool = array(1, kind="u1")
 
-    @classmethod
-    def unknown(cls, n: int, extras: int) -> "HandState":
-        """Nothing is known yet."""
-        N = 6 + n + extras
-        state = record(
-            cls,
-            **dict.fromkeys(("t_ns", "seen_ns", "triangulated_ns", "z_ns"), ("i8", 1)),
-            **dict.fromkeys(("searched", "hidden_ns"), ("i8", 5)),
-            **dict.fromkeys(("known", "measured_rotation_known"), ("u1", 1)),
-            **dict.fromkeys(("solver_mode", "vague"), ("u1", 5)),
-            **dict.fromkeys(("natural_weight", "speed", "lost_s"), 1),
-            **dict.fromkeys(("angles", "rates"), 20),
-            **dict.fromkeys(("then", "then_rates"), (5, 20)),
-            **dict.fromkeys(("z", "stationary"), extras),
-            measured_ns=("i8", 6),
-            palm=(4, 4),
-            x=n,
-            cov=(N, N),
-            z_cov=(extras, extras),
-            wrist_mean_rad=2,
-            coupling=3,
-            then_alike=5,
-            measured_rotation=(3, 3),
-        )
-        for never in (
-            state.t_ns,
-            state.z_ns,
-            state.seen_ns,
-            state.triangulated_ns,
-            state.measured_ns,
-            state.hidden_ns,
-        ):
-            never[:] = NEVER_NS
-        state.z_cov[:] = np.eye(extras)
-        return state
+
+def unknown_hand(**sizes: int) -> HandState:
+    """The state before anything is known."""
+    state = record(HandState, **sizes)
+    never = ("t_ns", "z_ns", "seen_ns", "triangulated_ns", "measured_ns", "hidden_ns")
+    return filled(state, **dict.fromkeys(never, NEVER_NS), z_cov=np.eye(sizes["K"]))
 
 
 class Hidden:
     """Prediction of fingers that nobody sees."""
 
-    angles: Float  # (20,) [rad]; those of fingers that are seen mean nothing
-    sigma: Float  # (20,) [rad] standard deviations of these
-    gone_s: Float  # (5,) time since they were seen last; 0: seen now
-    own: Float  # (5,) share of the variance of a step that the fingers that are seen do not explain
-    x: Float  # (n,) room
-    K: Float  # (4, 4) room
-    L: Float  # (4, 4) room
-    weight: Float  # (4,) room
-    ahead: Float  # (20,) room
-
-    @classmethod
-    def none(cls, n: int) -> "Hidden":
-        """Scratch for one hand."""
-        return record(cls, angles=20, sigma=20, gone_s=5, own=5, x=n, K=(4, 4), L=(4, 4), weight=4, ahead=20)
+    angles: Float = array(20)  # [rad]; those of fingers that are seen mean nothing
+    sigma: Float = array(20)  # [rad] standard deviations of these
+    gone_s: Float = array(5)  # time since they were seen last; 0: seen now
+    own: Float = array(5)  # share of the variance of a step that the fingers that are seen do not explain
+    x: Float = array("n")  # room
+    K: Float = array(4, 4)  # room
+    L: Float = array(4, 4)  # room
+    weight: Float = array(4)  # room
+    ahead: Float = array(20)  # room
 
 
 @inlined
@@ -252,10 +222,8 @@ def grow(
     - a palm without markers: by a turn and a shift that grow with the time it is lost, the shift with its speed, too.
     """
     elapsed_noise_s = max(dt_s, settings.shortest_s)
-    rotation2, shift2 = (
-        (settings.palm_process_noise_rad_s * elapsed_noise_s) ** 2,
-        (settings.palm_process_noise_m_s * elapsed_noise_s) ** 2,
-    )
+    rotation2 = (settings.palm_process_noise_rad_s * elapsed_noise_s) ** 2
+    shift2 = (settings.palm_process_noise_m_s * elapsed_noise_s) ** 2
     if palm_shown:
         squared = 0.0
         for i in range(3):
@@ -289,16 +257,10 @@ def grow(
 class ExtrasScratch:
     """Scratch for the extras' steps."""
 
-    M: Float  # (K, K)
-    A: Float  # (K, K)
-    B: Float  # (K, K)
-    L: Float  # (K, K)
-
-    @classmethod
-    def empty(cls, extras: int) -> "ExtrasScratch":
-        """Allocate it."""
-        K = extras
-        return record(cls, M=(K, K), A=(K, K), B=(K, K), L=(K, K))
+    M: Float = array("K", "K")
+    A: Float = array("K", "K")
+    B: Float = array("K", "K")
+    L: Float = array("K", "K")
 
 
 def stationary_of(settings: Settings, *, loose: bool, tilt_rad: float) -> Float:

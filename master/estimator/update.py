@@ -12,7 +12,16 @@ from master.estimator.covariance import add_second_order, is_small, linear, only
 from master.estimator.kinematics import angles_of, chains, clamp, free_of, joints, marker_point
 from master.estimator.posterior import Ground, Model, posterior
 from master.estimator.priors import PosturePrior
-from master.estimator.problem import EpochPrior, Observations, Rig, Search, contrary, marker_rows, sensed_palm
+from master.estimator.problem import (
+    EpochPrior,
+    Observations,
+    Problem,
+    Rig,
+    Search,
+    contrary,
+    marker_rows,
+    sensed_palm,
+)
 from master.estimator.sensors import EXTRAS
 from master.estimator.settings import Settings
 from master.estimator.solve import Blank, descend, likelier
@@ -51,23 +60,23 @@ def chi_square(
 ) -> float:
     """Return the markers' chi square on a hand that may move by `process_noise_m`."""
     work, mounts = search.rows, rig.mounts
-    angles_of(rig.hand, x, work.angles, work.by)
-    chains(rig.hand, T, work.angles, work.R, work.P)
+    angles_of(rig.hand, x, work)
+    chains(rig.hand, T, work)
     total = 0.0
     for m in range(mounts.finger.shape[0]):
         if not observed.seen[m]:
             continue
-        kept = search.J
+        kept, K = search.J, work.K
         own = observed.information[m] if observed.triangulated[m] else observed.own[m]
-        marker_point(mounts, m, T, work.R, work.P, work.point)
+        marker_point(mounts, m, T, work, work.point)
         for i in range(3):
             for j in range(3):
-                kept[i, j], work.K[i, j] = own[i, j], 0.0
+                kept[i, j], K[i, j] = own[i, j], 0.0
         if process_noise_m > 0.0:
-            inverse_3(own, work.K, own)
+            inverse_3(own, K, own)
             for i in range(3):
                 own[i, i] += process_noise_m * process_noise_m
-            inverse_3(own, work.K, own)
+            inverse_3(own, K, own)
         _, chi2 = marker_rows(rig.cameras, observed, m, work.point, work)
         copy(kept, own)
         total += chi2
@@ -75,11 +84,9 @@ def chi_square(
 
 
 @inner
-def _judge(
-    rig: Rig, settings: Settings, state: HandState, t_ns: int, observed: Observations, out: Estimate
-) -> None:
+def _judge(rig: Rig, state: HandState, t_ns: int, observed: Observations, out: Estimate) -> None:
     """Write which joints are tracked (small 95 % region, not too old), on what."""
-    hand = rig.hand
+    hand, settings = rig.hand, rig.settings
     for joint in range(26):
         f = hand.finger[joint]
         part = f if f >= 0 else PALM_PART
@@ -108,21 +115,17 @@ def _depth_noise(
 
     Perspective constrains it to centimetres only, and the fit is as sure of it as of the last epoch's.
     """
-    triangulated, seen = ground.most[0] > 1, ground.seen[0] > 0
+    triangulated, seen, sight = ground.most[0] > 1, ground.seen[0] > 0, epoch_prior.line_of_sight
     if triangulated or state.triangulated_ns[0] == NEVER_NS:
         state.triangulated_ns[0] = t_ns
     if triangulated or not seen:
         return
-    sigma_m = min(
-        settings.unobserved_depth_m_s * (t_ns - state.triangulated_ns[0]) * 1e-9,
-        settings.unobserved_depth_most_m,
-    )
+    drifted_m = settings.unobserved_depth_m_s * (t_ns - state.triangulated_ns[0]) * 1e-9
+    sigma_m = min(drifted_m, settings.unobserved_depth_most_m)
     for joint in range(26):
         for i in range(3):
             for j in range(3):
-                out.cov[joint, i, j] += (
-                    sigma_m * sigma_m * epoch_prior.line_of_sight[i] * epoch_prior.line_of_sight[j]
-                )
+                out.cov[joint, i, j] += sigma_m * sigma_m * sight[i] * sight[j]
 
 
 @kernel
@@ -132,28 +135,25 @@ def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_
     Returns chi square of the markers above which another hand explains them better; infinity: there is none;
     negative: no motion explains them, but it does.
     """
-    state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
-    rig, task, epoch_prior, scratch = (
-        Rig(model.hand[0], model.mounts, model.cameras, model.device[0]),
-        space.task,
-        space.epoch_prior,
-        space.scratch,
-    )
+    rig = Rig(model.hand[0], model.settings[0], model.mounts, model.cameras, model.device[0])
+    state, space, settings = boxed_state[0], boxed_space[0], rig.settings
+    task, epoch_prior, start = space.task, space.epoch_prior, space.scratch.start
+    search = space.scratch.search
     t_ns, limit = task.t_ns[0], np.inf
     dt_s = (t_ns - state.t_ns[0]) * 1e-9
     if task.may_leave[0] > 0:
-        free_of(rig.hand, task.angles, task.x)
-        limit = chi_square(rig, observed, task.palm, task.x, 0.0, scratch.search) + settings.misled
+        free_of(rig.hand, task.angles, start.x)
+        limit = chi_square(rig, observed, task.palm, start.x, 0.0, search) + settings.misled
         process_noise_m = settings.palm_process_noise_m_s * dt_s
-        if chi_square(rig, observed, state.palm, state.x, process_noise_m, scratch.search) > limit:
+        if chi_square(rig, observed, state.palm, state.x, process_noise_m, search) > limit:
             return -1.0
     predict(rig.hand, settings, state, t_ns, space.ground.shown, space.hidden, epoch_prior)
-    _rotate_on(state, epoch_prior, scratch.search)
+    _rotate_on(state, epoch_prior, search)
     task.natural_weight[0], task.counts[0] = state.natural_weight[0], exp(-dt_s / settings.component_memory_s)
-    copy(epoch_prior.palm, scratch.start_T)
+    copy(epoch_prior.palm, start.palm)
     for c in range(state.x.shape[0]):
-        scratch.start_x[c] = state.x[c]
-    start_scanned(rig.hand, space.scan, task.scanned, scratch.search.x, scratch.start_x)
+        start.x[c] = state.x[c]
+    start_scanned(rig.hand, space.scan, task.scanned, search.trial.x, start.x)
     return limit
 
 
@@ -184,57 +184,24 @@ def fit_epoch(
 ) -> float:
     """Fit the hand of one epoch in place; return chi square of the markers.
 
-    From the prediction of `predict_epoch`, or roughly from the task's hand: then the cost is returned. What
-    is found is in `found` of `boxed_space`, (1,) `Workspace`.
+    From `start` of the scratch, or roughly, in place: then the cost is returned. What is found is in `found`
+    of `boxed_space`, (1,) `Workspace`.
     """
-    space, settings = boxed_space[0], model.settings[0]
-    rig, task, epoch_prior, scratch = (
-        Rig(model.hand[0], model.mounts, model.cameras, model.device[0]),
-        space.task,
-        space.epoch_prior,
-        space.scratch,
-    )
-    search, found = scratch.search, space.found
+    rig = Rig(model.hand[0], model.settings[0], model.mounts, model.cameras, model.device[0])
+    space, settings = boxed_space[0], rig.settings
+    task, epoch_prior, scratch, found = space.task, space.epoch_prior, space.scratch, space.found
+    problem, search = Problem(rig, posture_prior, epoch_prior, observed), scratch.search
     if task.coarse[0] > 0:
-        cost, _ = descend(
-            rig,
-            posture_prior,
-            epoch_prior,
-            observed,
-            posture_prior.constant.shape[0] - 1,
-            settings.coarse,
-            settings.tolerance_share,
-            task.palm,
-            task.x,
-            scratch.start_z,
-            scratch.each[0].gradient,
-            scratch.each[0].normal,
-            search,
-        )
+        widest = posture_prior.constant.shape[0] - 1
+        cost, _ = descend(problem, widest, settings.coarse, settings.tolerance_share, scratch.start, search)
         return cost
-    posterior(
-        rig,
-        settings,
-        posture_prior,
-        epoch_prior,
-        observed,
-        scratch.start_T,
-        scratch.start_x,
-        scratch.start_z,
-        task.natural_weight[0],
-        task.counts[0],
-        space.ground.numbers[0],
-        blank,
-        scratch,
-        found,
-    )
+    posterior(problem, task, space.ground.numbers[0], blank, scratch, found)
     if found.z.shape[0] == EXTRAS:
         extras_only(epoch_prior, found, search)
     if epoch_prior.lines_of_sight.rows[0] > 0.0:
         take_scanned(rig, space.ground, space.scan, found, search.rows)
-    found.contrary[0] = (
-        contrary(epoch_prior, found.palm, found.z, search) if epoch_prior.oriented[0] > 0.0 else 0.0
-    )
+    oriented = epoch_prior.oriented[0] > 0.0
+    found.contrary[0] = contrary(epoch_prior, found.palm, found.z, search) if oriented else 0.0
     return chi_square(rig, observed, found.palm, found.x, 0.0, search)
 
 
@@ -255,12 +222,12 @@ def take_over_epoch(
     model: Model, boxed_state: Any, goes_on: bool, observed: Observations, boxed_space: Any, out: Estimate
 ) -> None:
     """Write the hand `fit_epoch` found, and the state; not `goes_on`: forget it."""
-    state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
-    rig, task = Rig(model.hand[0], model.mounts, model.cameras, model.device[0]), space.task
+    rig = Rig(model.hand[0], model.settings[0], model.mounts, model.cameras, model.device[0])
+    state, space, settings, task = boxed_state[0], boxed_space[0], rig.settings, boxed_space[0].task
     t_ns, shown, palm_shown = task.t_ns[0], space.ground.shown, task.palm_shown[0] > 0
     found, hidden, scratch, work = space.found, space.hidden, space.cov_scratch, space.scratch.search.rows
     hand, n = rig.hand, found.x.shape[0]
-    angles_of(hand, found.x, work.angles, work.by)
+    angles_of(hand, found.x, work)
     clamp(hand, work.angles)
     dt_s = (t_ns - state.t_ns[0]) * 1e-9 if state.t_ns[0] != NEVER_NS else 0.0
     lost = not palm_shown
@@ -285,22 +252,13 @@ def take_over_epoch(
         copy(space.scratch.A, state.cov)
     else:
         copy(found.cov, state.cov)
-    chains(hand, found.palm, work.angles, work.R, work.P)
-    joints(hand, found.palm, work.R, work.P, out.position, out.rotation)
+    chains(hand, found.palm, work)
+    joints(hand, found.palm, work, out.position, out.rotation)
     linear(hand, found.palm, state.cov, work, scratch, out.cov)
-    tilts(hand, settings, found.palm, found.cov, work, scratch, out.tilt, out.tilt_process_noise)
+    tilts(rig, found.palm, found.cov, work, scratch, out.tilt, out.tilt_process_noise)
     if task.second_order[0] > 0:
-        add_second_order(
-            rig,
-            settings,
-            found.palm,
-            state.cov,
-            observed.seen,
-            space.scratch.each[likelier(space.scratch)].information,
-            work,
-            scratch,
-            out.cov,
-        )
+        information = space.scratch.each[likelier(space.scratch)].information
+        add_second_order(rig, found.palm, state.cov, observed.seen, information, work, scratch, out.cov)
     _depth_noise(settings, state, t_ns, space.ground, space.epoch_prior, out)
     state.t_ns[0], state.known[0], state.natural_weight[0] = t_ns, True, found.natural_weight[0]
     for f in range(5):
@@ -331,4 +289,4 @@ def take_over_epoch(
         out.angles[a] = state.angles[a] = work.angles[a]
     for c in range(n):
         state.x[c] = found.x[c]
-    _judge(rig, settings, state, t_ns, observed, out)
+    _judge(rig, state, t_ns, observed, out)

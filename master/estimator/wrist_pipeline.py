@@ -1,9 +1,9 @@
-"""Pipelines of a wrist device, alone or with marker cameras and an IMU.
+"""A wrist device, alone or beside marker cameras and an IMU.
 
 All are push machines without clock, socket or thread: live and offline runs push the same messages and get
 the same poses. `WristPipeline`: strobe cycles -> rows -> estimator -> pose, of a device alone. The rig's
 frame is the camera's, so the palm stands where calibration found it. A finger that was not seen for half a
-second is not valid, and NaN. `FusedPipeline`: an epoch of the cameras uses rows of the strobe cycle before
+second is not valid, and NaN. `WristSide`: an epoch of the cameras uses rows of the strobe cycle before
 it, if there is a new one, and how the IMU has the forearm turned; where the cameras are silent, epochs are
 those of the strobe cycles. A silent sensor adds no row: there is no state in which one is used and another
 not.
@@ -29,17 +29,23 @@ import numpy as np
 from common.arrays import Bool, Code, Float
 from common.calibration import ImuCalibration
 from common.geometry.transforms import Wxyz, matrix_of, matrix_to_quaternion, quaternion_product
-from common.hand.model import CHAINS, FINGERS
+from common.hand.model import CHAINS
 from common.hand.wrist import wrist_quaternion
 from common.kernels import bound
-from common.messages import Detections, HandPose, Source, WristDetections
-from master.estimator.epoch import CycleReader, Epoch, Fitted, OrientationMeasurement, WristRows
-from master.estimator.estimator import Estimator
+from common.messages import HandPose, Source, WristDetections
+from master.estimator.epoch import (
+    CycleReader,
+    Epoch,
+    Fitted,
+    MarkerPositions,
+    OrientationMeasurement,
+    count_fingers,
+)
+from master.estimator.estimator import Estimator, pose_of
 from master.estimator.kinematics import quaternions
 from master.estimator.pipeline import (
     SURE_RAD,
     Between,
-    MarkerPipeline,
     OrientationSamples,
     SolvedPose,
     Stage,
@@ -47,9 +53,8 @@ from master.estimator.pipeline import (
 )
 from master.estimator.posterior import ON_MARKERS
 from master.estimator.priors import WristModel, loosened
-from master.estimator.sensors import HEADING, TILT, WRIST_ANGLES
+from master.estimator.sensors import HEADING, TILT, WRIST_ANGLES, WristRows
 from master.estimator.settings import DEFAULT, Settings
-from master.rig.merge import inside
 from master.rig.wrist import WristSetup
 
 ANYWHERE_RAD = pi / sqrt(3.0)  # standard deviation of a uniform circle
@@ -206,7 +211,8 @@ def _wxyz(rotation: Float) -> Wxyz:
 _ORIENTATION_INFO = np.eye(3) * 1e6  # of a palm that stands: a thousandth of a radian
 _PALM = np.setdiff1d(np.arange(26), CHAINS)
 _NO_AXES = np.zeros((3, 3))
-_NO_POINTS = np.empty((0, 3)), np.empty((0, 3, 3))
+_NO_POINTS, _NO_COV, _NO_FLAGS = np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, np.bool_)
+_NO_MARKERS = MarkerPositions(_NO_POINTS, _NO_COV, _NO_COV, _NO_FLAGS, _NO_FLAGS[None])
 _STRAIGHT = np.zeros(2), np.zeros((2, 2))
 
 
@@ -228,8 +234,8 @@ class WristPipeline:
         self._estimator = Estimator(
             (setup.optics,), self._hand, (), (), continuous=continuous, settings=settings, wrist=self._model
         )
-        self._quaternions = bound(quaternions, np.empty((26, 3, 3)), np.empty((26, 4)))
-        self._reader = CycleReader(setup, self._model.cubic, self.counts)
+        bound(quaternions, np.empty((26, 3, 3)), np.empty((26, 4)))  # compiles it here, so that no pose waits
+        self._reader = CycleReader(setup, self.counts)
         T = setup.T_camera_palm
         self._orientation = OrientationMeasurement(
             np.ascontiguousarray(T[:3, :3]), _ORIENTATION_INFO, sure=True, axes=_NO_AXES
@@ -253,7 +259,7 @@ class WristPipeline:
             hand = self._estimator.push(
                 Epoch(
                     t_ns,
-                    _NO_POINTS[0],
+                    _NO_POINTS,
                     np.zeros(3),
                     orientation=self._orientation,
                     wrist=rows,
@@ -288,39 +294,18 @@ class WristPipeline:
             ("held", known & ~measured),
             ("unseen", ~known),
         ):
-            for f, happens in enumerate(fingers.tolist()):
-                if happens:
-                    self.counts[f"{event}.{FINGERS[f]}"] += 1
-        tracked, source, orientation = hand.tracked, hand.source, np.empty((26, 4))
-        if hand.solution is None:
-            valid, position, angles = np.zeros(26, np.bool_), np.full((26, 3), nan), np.full((5, 4), nan)
-            orientation[:], cov = nan, np.full((26, 3, 3), nan)
-        else:
-            solution, valid = hand.solution, np.ones(26, np.bool_)
-            position, cov = solution.joints.position_m, solution.cov_m2
-            angles = solution.angles_rad
-            self._quaternions(solution.joints.rotation, orientation)
+            count_fingers(self.counts, event, fingers)
+        if hand.solution is not None:
+            hand.valid[:] = True
             if not known.all():
-                lost = CHAINS[~known].ravel()
-                valid[lost], tracked[lost], source[lost] = False, False, Source.NONE
-                position[lost], orientation[lost], cov[lost] = nan, nan, nan
-                angles[~known] = nan
-            tracked[_PALM], source[_PALM] = tracked[CHAINS[measured]].any(), Source.WRIST
-        return HandPose.known_good(
-            hand=self._hand.profile.name,
-            t_ns=t_ns,
-            position_m=position,
-            orientation_wxyz=orientation,
-            radius_m=self._hand.radius_m,
-            valid=valid,
-            tracked=tracked,
-            cov_m2=cov,
-            source=source,
-            angles_rad=angles,
-            markers_m=_NO_POINTS[0],
-            markers_raw_m=_NO_POINTS[0],
-            markers_cov_m2=_NO_POINTS[1],
-            inside_volume=inside(self._setup.volume, position),
+                lost, joints = CHAINS[~known].ravel(), hand.solution.joints
+                hand.valid[lost], hand.tracked[lost], hand.source[lost] = False, False, Source.NONE
+                joints.position_m[lost], joints.rotation[lost], hand.solution.cov_m2[lost] = nan, nan, nan
+                hand.solution.angles_rad[~known] = nan
+            hand.tracked[_PALM], hand.source[_PALM] = hand.tracked[CHAINS[measured]].any(), Source.WRIST
+        pose = pose_of(hand, self._hand, t_ns, _NO_MARKERS.points_m, _NO_MARKERS, self._setup.volume)
+        return msgspec.structs.replace(
+            pose,
             laser_m=laser_m,
             palm_world_wxyz=world[0],
             palm_world_sigma_rad=world[1],
@@ -338,9 +323,7 @@ class WristSide:
     `forearm`: of the IMU; None: there is none, or it is not known how it is mounted or placed.
     """
 
-    def __init__(
-        self, setup: WristSetup, reader: CycleReader, counts: Counter[str], *, continuous: bool
-    ) -> None:
+    def __init__(self, setup: WristSetup, counts: Counter[str], *, continuous: bool) -> None:
         """Join the parts.
 
         `counts` are by event and finger: `late`, `outside`, `no_plane`, `tip_refused`, `off`, `ambiguous`;
@@ -349,7 +332,7 @@ class WristSide:
         self.counts, self._setup, self._continuous = counts, setup, continuous
         forearm = None if setup.imu is None else Forearm(setup.imu, counts)
         self.forearm = forearm if forearm is not None and forearm.placed else None
-        self.reader = reader
+        self._reader = CycleReader(setup, counts)
         kept = 8
         self._waiting: deque[WristDetections] = deque(maxlen=kept)
         self._last_ns = -(2**62)
@@ -380,7 +363,7 @@ class WristSide:
                 message = None
         if message is None:
             return None
-        rows, self.laser_m = self.reader.read(message, t_ns)
+        rows, self.laser_m = self._reader.read(message, t_ns)
         self.laser_ns = message.t_ns + late_ns
         return rows
 
@@ -399,9 +382,9 @@ class WristSide:
         """Learn from an epoch; `oriented`: it had a TURN row to begin with."""
         if hand.solver_mode.any():
             self.solver_mode, self.ambiguous = hand.solver_mode, hand.ambiguous
-        self._count("tip_refused", hand.refused)
-        self._count("off", hand.off)
-        self._count("ambiguous", hand.ambiguous)
+        count_fingers(self.counts, "tip_refused", hand.refused)
+        count_fingers(self.counts, "off", hand.off)
+        count_fingers(self.counts, "ambiguous", hand.ambiguous)
         if self.forearm is None or hand.solution is None or not hand.sources[5] & ON_MARKERS:
             return
         if oriented and self.forearm.contradicted(t_ns, by_palm=hand.rotation_rejected):
@@ -430,50 +413,3 @@ class WristSide:
             changes["laser_m"] = self.laser_m
             changes["solver_mode"], changes["ambiguous"] = self.solver_mode, self.ambiguous
         return msgspec.structs.replace(pose, **changes)
-
-    def _count(self, event: str, fingers: Bool) -> None:
-        for f, happens in enumerate(fingers.tolist()):
-            if happens:
-                self.counts[f"{event}.{FINGERS[f]}"] += 1
-
-
-class FusedPipeline:
-    """Push machine: a marker line, its wrist side, when cameras last made a pose."""
-
-    def __init__(self, markers: MarkerPipeline, side: WristSide, slowest_hz: float) -> None:
-        """Join the parts.
-
-        Args:
-            markers: The marker line with that wrist side; both count into the same.
-            slowest_hz: Frame rate of the slowest marker camera.
-        """
-        self.counts, self._markers, self._side = markers.counts, markers, side
-        # of the slowest camera: when so long no epoch came, the device's strobe cycles lead
-        silent_frames = 2.2
-        self._silent_ns = round(silent_frames * 1e9 / slowest_hz)
-        self._last_ns: int | None = None
-
-    def push(self, message: Detections) -> list[SolvedPose]:
-        """Take what one camera saw; return the poses it completes, oldest first."""
-        if not isinstance(message, WristDetections):
-            poses = self._markers.push(message)
-            if poses:
-                self._last_ns = poses[-1].pose.t_ns
-            return poses
-        t_ns = self._side.push(message)
-        if t_ns is None or (self._last_ns is not None and t_ns - self._last_ns <= self._silent_ns):
-            return []
-        solved = self._markers.no_observation(t_ns, message.ready_t_ns)
-        self.counts["poses_by_wrist"] += 1
-        return [] if solved is None else [solved]
-
-    def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
-        """Take the orientation (4,) that the IMU on the forearm reports."""
-        if self._side.forearm is None:
-            self.counts["orientation.unplaced"] += 1
-        else:
-            self._side.forearm.push(t_ns, orientation_wxyz, heading_sigma_rad)
-
-    def flush(self) -> list[SolvedPose]:
-        """At the end of a recording: the poses that still wait for a camera."""
-        return self._markers.flush()

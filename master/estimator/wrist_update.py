@@ -31,7 +31,7 @@ from master.estimator.sensors import (
     loosen_short,
 )
 from master.estimator.settings import Settings
-from master.estimator.solve import Posterior, palm_off
+from master.estimator.solve import Posterior, palm_off, past_gradient
 from master.estimator.state import NEVER_NS, HandState, predict_extras
 
 _BENT_RAD2 = radians(45.0) ** 2  # of a finger that counts as one
@@ -65,17 +65,9 @@ _FK, _IK = int(SolverMode.FK), int(SolverMode.IK)
 
 
 @inner
-def _expected(
-    hand: HandTables,
-    device: Any,
-    settings: Settings,
-    state: HandState,
-    task: Task,
-    lines_of_sight: LinesOfSight,
-    scan: Scan,
-    prior: Prior,
-) -> None:
+def _expected(rig: Rig, state: HandState, task: Task, lines: LinesOfSight, scan: Scan, prior: Prior) -> None:
     """Write the fingers' prior before a strobe cycle; bring its rows to the epoch."""
+    settings = rig.settings
     dt_s = (task.t_ns[0] - state.t_ns[0]) * 1e-9
     measured_lately = task.continuous[0] > 0 and state.known[0] > 0 and 0.0 < dt_s <= settings.forget_s
     prior.light[0], prior.light2[0] = state.z[LED_SCALE], state.z_cov[LED_SCALE, LED_SCALE]
@@ -84,12 +76,8 @@ def _expected(
         age_s = (task.t_ns[0] - state.measured_ns[f]) * 1e-9
         had_previous = measured_lately and age_s <= settings.forget_s
         prior.had_previous[f] = 1.0 if had_previous else 0.0
-        known = (
-            had_previous
-            and state.solver_mode[f] > 0
-            and state.vague[f] == 0
-            and age_s <= settings.tracked_cycle_s
-        )
+        well = state.solver_mode[f] > 0 and state.vague[f] == 0
+        known = had_previous and well and age_s <= settings.tracked_cycle_s
         state.searched[f] = state.searched[f] + 1 if known else 0
         known = known and state.searched[f] % settings.search_again != 0
         prior.near_rad[f] = settings.near_rad if known else 0.0
@@ -99,20 +87,20 @@ def _expected(
                 scan.angles[k] = state.angles[k]
         prior.last[f] = scan.angles[4 * f + 2]
         prior.process_noise[f] = max(settings.process_noise_rad_s * age_s, settings.goes_on_rad)
-        if lines_of_sight.lit[f] == 0.0 and lines_of_sight.shown[f] == 0.0:
+        if lines.lit[f] == 0.0 and lines.shown[f] == 0.0:
             continue
-        look(hand, device, prior.palm, prior.wrist_axes, scan.angles, f, MOVES, scan.surface)
+        look(rig.hand, rig.device, prior.palm, prior.wrist_axes, scan.angles, f, MOVES, scan.surface)
         J = scan.surface.J
-        loosen(lines_of_sight.laser_W[f], J, 0, state.z_cov)
-        loosen(lines_of_sight.tip_W[f], J, 2, state.z_cov)
+        loosen(lines.laser_W[f], J, 0, state.z_cov)
+        loosen(lines.tip_W[f], J, 2, state.z_cov)
         if not had_previous:
             continue
         for k in range(4):
             rate = state.rates[4 * f + k]
             for i in range(2):
-                lines_of_sight.laser[f, i] -= J[i, k] * rate * lines_of_sight.laser_s[0]
-                lines_of_sight.tip[f, i] -= J[2 + i, k] * rate * lines_of_sight.tip_s[0]
-            lines_of_sight.depth[f] -= J[4, k] * rate * lines_of_sight.tip_s[0]
+                lines.laser[f, i] -= J[i, k] * rate * lines.laser_s[0]
+                lines.tip[f, i] -= J[2 + i, k] * rate * lines.tip_s[0]
+            lines.depth[f] -= J[4, k] * rate * lines.tip_s[0]
 
 
 @kernel
@@ -122,60 +110,77 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
     What no pose explains is no row: a fingertip that is another thing, a laser point on one. The rows that
     are left are counted.
     """
-    state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
-    hand, device, task, epoch_prior = model.hand[0], model.device[0], space.task, space.epoch_prior
-    lines_of_sight, scan, prior = epoch_prior.lines_of_sight, space.scan, space.prior
+    rig = Rig(model.hand[0], model.settings[0], model.mounts, model.cameras, model.device[0])
+    state, space, settings = boxed_state[0], boxed_space[0], rig.settings
+    task, epoch_prior, scan, prior = space.task, space.epoch_prior, space.scan, space.prior
+    lines, z = epoch_prior.lines_of_sight, state.z
     dt_s = 0.0 if state.z_ns[0] == NEVER_NS else (task.t_ns[0] - state.z_ns[0]) * 1e-9
     predict_extras(settings, state, dt_s, task.process_noise_rad2[0], epoch_prior, space.extras)
     state.z_ns[0] = task.t_ns[0]
-    for i in range(state.z.shape[0]):
-        space.scratch.start_z[i] = state.z[i]
+    for i in range(z.shape[0]):
+        space.scratch.start.z[i] = z[i]
     for f in range(5):
-        scan.known[f] = lines_of_sight.teaches[f] = 0.0
+        scan.known[f] = lines.teaches[f] = 0.0
         task.refused[f] = task.off[f] = task.ambiguous[f] = False
         task.solver_mode[f] = 0
-    if state.z.shape[0] < EXTRAS or lines_of_sight.rows[0] == 0.0:
+    if z.shape[0] < EXTRAS or lines.rows[0] == 0.0:
         return
-    flexed_palm(device.palm, state.z[WRIST_ANGLES], state.z[WRIST_ANGLES + 1], prior.palm, prior.wrist_axes)
-    _expected(hand, device, settings, state, task, lines_of_sight, scan, prior)
+    flexed_palm(rig.device.palm, z[WRIST_ANGLES], z[WRIST_ANGLES + 1], prior.palm, prior.wrist_axes)
+    _expected(rig, state, task, lines, scan, prior)
     expect_coupling(settings, state, max(dt_s, 0.0), prior)
     for f in range(5):
-        if lines_of_sight.lit[f] == 0.0:
+        if lines.lit[f] == 0.0:
             if prior.had_previous[f] == 0.0:
-                lines_of_sight.shown[f] = 0.0
+                lines.shown[f] = 0.0
             continue
-        scan_finger(hand, device, settings, lines_of_sight, prior, f, lines_of_sight.shown[f] > 0.0, scan)
-        if loosen_short(device, lines_of_sight, f, _length_px(scan, f), scan.g[:3], scan.H[:2, :2]):
-            scan_finger(hand, device, settings, lines_of_sight, prior, f, lines_of_sight.shown[f] > 0.0, scan)
-        if prior.near_rad[f] > 0.0 and scan.chi2[f] > settings.refused:
-            prior.near_rad[f] = 0.0
-            scan_finger(hand, device, settings, lines_of_sight, prior, f, lines_of_sight.shown[f] > 0.0, scan)
-        if scan.chi2[f] > settings.refused and lines_of_sight.depth_w2[f] > 0.0:
-            # a tip may shine, or lie in shade: what it is off then is its light
-            lines_of_sight.depth_w2[f] = 0.0
-            scan_finger(hand, device, settings, lines_of_sight, prior, f, True, scan)
-        gate = settings.refused if lines_of_sight.depth_w2[f] > 0.0 else settings.refused_unlit
-        if scan.chi2[f] > gate and lines_of_sight.shown[f] > 0.0:
-            task.refused[f], lines_of_sight.shown[f] = True, 0.0
-            scan_finger(hand, device, settings, lines_of_sight, prior, f, False, scan)
-        if scan.chi2[f] > settings.refused:
-            task.off[f], lines_of_sight.lit[f], scan.known[f] = True, 0.0, 0.0
-    weigh_hands(hand, settings, lines_of_sight, prior, scan)
+        _scan(rig, lines, prior, f, scan, task)
+    weigh_hands(rig, lines, prior, scan)
     for f in range(5):
         if scan.known[f] > 0.0:
-            choose(hand, settings, lines_of_sight, prior, f, scan)
-            for k in range(4):
-                task.scanned[4 * f + k] = scan.mode[f, k]
-            task.solver_mode[f] = _IK if lines_of_sight.shown[f] > 0.0 else _FK
-            curled = f > 0 and scan.out[f, 2] > settings.branch_rad
-            task.ambiguous[f] = scan.parts[f] > 1.5 or (curled and lines_of_sight.shown[f] == 0.0)
-            # The unit of light is learnt a little at a time, and nothing of a finger that is ambiguous.
-            excluded = task.ambiguous[f] or scan.chi2[f] > settings.teaching_gate
-            lines_of_sight.teaches[f] = 1.0 if lines_of_sight.shown[f] > 0.0 and not excluded else 0.0
-            lines_of_sight.depth_w2[f] *= 0.0 if excluded else settings.light_share
-            if f > 0 and not curled and lines_of_sight.teaches[f] > 0.0:
-                learn_coupling(prior, f, scan, state)
-    _count(lines_of_sight, space.ground)
+            _choose(rig, lines, prior, f, scan, task, state)
+    _count(lines, space.ground)
+
+
+@inner
+def _scan(rig: Rig, lines: LinesOfSight, prior: Prior, f: int, scan: Scan, task: Task) -> None:
+    """Search the minima of a lit finger; drop rows that no pose explains."""
+    settings = rig.settings
+    scan_finger(rig, lines, prior, f, scan)
+    if loosen_short(rig.device, lines, f, _length_px(scan, f), scan.g[:3], scan.H[:2, :2]):
+        scan_finger(rig, lines, prior, f, scan)
+    if prior.near_rad[f] > 0.0 and scan.chi2[f] > settings.refused:
+        prior.near_rad[f] = 0.0
+        scan_finger(rig, lines, prior, f, scan)
+    if scan.chi2[f] > settings.refused and lines.depth_w2[f] > 0.0:
+        # a tip may shine, or lie in shade: what it is off then is its light
+        lines.depth_w2[f] = 0.0
+        scan_finger(rig, lines, prior, f, scan)
+    gate = settings.refused if lines.depth_w2[f] > 0.0 else settings.refused_unlit
+    if scan.chi2[f] > gate and lines.shown[f] > 0.0:
+        task.refused[f], lines.shown[f] = True, 0.0
+        scan_finger(rig, lines, prior, f, scan)
+    if scan.chi2[f] > settings.refused:
+        task.off[f], lines.lit[f], scan.known[f] = True, 0.0, 0.0
+
+
+@inner
+def _choose(
+    rig: Rig, lines: LinesOfSight, prior: Prior, f: int, scan: Scan, task: Task, state: HandState
+) -> None:
+    """Choose a pose of a scanned finger; note what it teaches."""
+    settings, shown = rig.settings, lines.shown[f] > 0.0
+    choose(rig, lines, prior, f, scan)
+    for k in range(4):
+        task.scanned[4 * f + k] = scan.mode[f, k]
+    task.solver_mode[f] = _IK if shown else _FK
+    curled = f > 0 and scan.out[f, 2] > settings.branch_rad
+    task.ambiguous[f] = scan.parts[f] > 1.5 or (curled and not shown)
+    # The unit of light is learnt a little at a time, and nothing of a finger that is ambiguous.
+    excluded = task.ambiguous[f] or scan.chi2[f] > settings.teaching_gate
+    lines.teaches[f] = 1.0 if shown and not excluded else 0.0
+    lines.depth_w2[f] *= 0.0 if excluded else settings.light_share
+    if f > 0 and not curled and lines.teaches[f] > 0.0:
+        learn_coupling(prior, f, scan, state)
 
 
 @inner
@@ -192,12 +197,12 @@ def _length_px(scan: Scan, f: int) -> float:
 
 
 @inner
-def _count(lines_of_sight: LinesOfSight, ground: Ground) -> None:
+def _count(lines: LinesOfSight, ground: Ground) -> None:
     """Count the rows of a wrist device; tips without laser points count for nothing."""
     lit, shown = 0, 0
     for f in range(5):
-        shown += 1 if lines_of_sight.shown[f] > 0.0 else 0
-        if lines_of_sight.lit[f] > 0.0:
+        shown += 1 if lines.shown[f] > 0.0 else 0
+        if lines.lit[f] > 0.0:
             lit += 1
             ground.shown[f] = True
     if lit > 0:
@@ -223,13 +228,7 @@ def extras_only(epoch_prior: EpochPrior, found: Posterior, search: Search) -> No
     """
     n, K, off = found.x.shape[0], found.z.shape[0], search.off
     palm_off(found.palm, epoch_prior.palm, off)
-    depth = 0.0
-    for i in range(3):
-        depth += epoch_prior.line_of_sight[i] * off[3 + i]
-    for i in range(6):
-        search.step[i] = epoch_prior.palm_w2[i] * off[i]
-        if i >= 3:
-            search.step[i] += epoch_prior.depth_w2[0] * depth * epoch_prior.line_of_sight[i - 3]
+    past_gradient(epoch_prior, off, search.step)
     for i in range(n):
         search.step[6 + i] = epoch_prior.past_w2[i] * (found.x[i] - epoch_prior.past[i])
     for k in range(K):
@@ -246,7 +245,7 @@ def take_scanned(rig: Rig, ground: Ground, scan: Scan, found: Posterior, work: S
     What the others know of the finger beside its PIP is in the fit's covariance given the PIP.
     """
     hand, cov = rig.hand, found.cov
-    angles_of(hand, found.x, work.angles, work.by)
+    angles_of(hand, found.x, work)
     for f in range(5):
         if scan.known[f] > 0.0 and ground.sources[f] == 0:
             for k in range(4):

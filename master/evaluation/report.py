@@ -5,6 +5,7 @@ A simulated run is compared with the exact scene at its poses: figures, a pictur
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -28,7 +29,7 @@ from master.evaluation.score import Truth, score, score_hidden
 from master.evaluation.wrist_score import WristTruth, score_laser, score_wrist
 from master.outputs.picture import best_row, draw_summary
 from master.outputs.picture_overlays import ResultPicture, WristPicture
-from master.outputs.poses import Poses, PosesTruth, load_poses
+from master.outputs.poses import Poses, PosesTruth
 from master.outputs.rerun import write_rrd
 from master.replay.offline import fingers_of
 from master.rig.setup import RigSetup
@@ -92,17 +93,23 @@ def lit_view(renderer: WristRenderer, t_s: float) -> Image:
     return np.asarray(cv2.add(cv2.subtract(laser, ambient), cv2.subtract(led, ambient)), np.uint8)
 
 
-def wrist_images(
-    poses: Poses, scene: WristScene, epoch_ns: int, progress: Progress
+def _images(
+    poses: Poses, camera: str, render: Callable[[float], Image], epoch_ns: int, progress: Progress
 ) -> Iterator[tuple[str, int, Image]]:
-    """Camera, time [ns] and `lit_view`, twice a second."""
+    """Camera, time [ns] and its image, twice a second."""
     first, last = int(poses.t_ns[0]), int(poses.t_ns[-1])
-    camera = scene.rig.cameras[0]
-    renderer = WristRenderer(scene, camera)
     images_hz = 2.0
     for t_ns in range(first, last, int(1e9 / images_hz)):
         progress(f"rendering camera {camera}", t_ns - first, last - first)
-        yield camera, t_ns, lit_view(renderer, (t_ns - epoch_ns) * 1e-9)
+        yield camera, t_ns, render((t_ns - epoch_ns) * 1e-9)
+
+
+def wrist_images(
+    poses: Poses, scene: WristScene, epoch_ns: int, progress: Progress
+) -> Iterator[tuple[str, int, Image]]:
+    """Images of the wrist camera by `lit_view`."""
+    camera = scene.rig.cameras[0]
+    yield from _images(poses, camera, partial(lit_view, WristRenderer(scene, camera)), epoch_ns, progress)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,7 +177,7 @@ def report_scene(
     Raises:
         RecordingError: The poses cannot be read or a result cannot be written.
     """
-    poses = load_poses(poses_file)
+    poses = Poses.load(poses_file)
     poses = poses.rows(int(np.searchsorted(poses.t_ns, epoch_ns)), len(poses))
     if len(poses) == 0:
         return summary
@@ -213,11 +220,11 @@ def _of_markers(
     scores = score(poses, truth, fingers)
     if hidden:
         scores |= score_hidden(poses, truth, fingers)
-    return _Judged(
-        scores,
-        PosesTruth.of_webxr(truth.joints_m, truth.markers_m),
-        _images(poses, scene, epoch_ns, progress),
+    images = chain.from_iterable(
+        _images(poses, camera, Renderer(scene, camera).render, epoch_ns, progress)
+        for camera in scene.rig.cameras
     )
+    return _Judged(scores, PosesTruth.of_webxr(truth.joints_m, truth.markers_m), images)
 
 
 def _of_wrist(
@@ -248,19 +255,7 @@ def truth_of(poses: Poses, scene: Scene, epoch_ns: int, progress: Progress) -> T
         now = scene.truth(float(t))
         joints[row], pip[row], markers[row] = now.joints.position_m[1:], now.angles_rad[1:, 2], now.markers_m
         for c, renderer in enumerate(renderers):
-            visible[row, c] = np.nan_to_num(renderer.visible_fraction(float(t)))
+            visible[row, c] = np.nan_to_num(renderer.markers(float(t)).visible)
         if row % 20 == 0:
             progress("comparing with the truth", row, len(times))
     return Truth(poses.t_ns, joints, pip, markers, visible)
-
-
-def _images(
-    poses: Poses, scene: Scene, epoch_ns: int, progress: Progress
-) -> Iterator[tuple[str, int, Image]]:
-    first, last = int(poses.t_ns[0]), int(poses.t_ns[-1])
-    for camera in scene.rig.cameras:
-        renderer = Renderer(scene, camera)
-        images_hz = 2.0
-        for t_ns in range(first, last, int(1e9 / images_hz)):
-            progress(f"rendering camera {camera}", t_ns - first, last - first)
-            yield camera, t_ns, renderer.render((t_ns - epoch_ns) * 1e-9)

@@ -20,9 +20,7 @@ from master.outputs.result_files import (
     Contacts,
     ObjectPoses,
     contact_path,
-    load_contact,
     load_gesture_messages,
-    load_object,
     object_path,
 )
 from master.rig.setup import RigSetup
@@ -47,8 +45,8 @@ class RunResults:
         spoken = folder / GESTURES
         gestures = load_gesture_messages(spoken) if spoken.exists() else []
         return cls(
-            tuple(load_object(path) for path in objects if path.exists()),
-            tuple(load_contact(path) for path in contacts if path.exists()),
+            tuple(ObjectPoses.load(path) for path in objects if path.exists()),
+            tuple(Contacts.load(path) for path in contacts if path.exists()),
             tuple(one for one in gestures if one.hand == hand and one.t_ns >= from_ns),
         )
 
@@ -110,27 +108,19 @@ def judge_gestures(
     """
     begun = [one for one in _beginnings(published) if one.kind != "pose"]
     first_s, end_s = (from_ns - epoch_ns) * 1e-9, (until_ns - epoch_ns) * 1e-9
-    made = [
-        (one, cycle * motion.period_s)
-        for cycle in range(int(end_s // motion.period_s) + 1)
-        for one in motion.annotations
-        if first_s <= one.start_s + cycle * motion.period_s and one.stop_s + cycle * motion.period_s <= end_s
-    ]
+    turns_s = [turn * motion.period_s for turn in range(int(end_s // motion.period_s) + 1)]
+    spans = [(one, one.start_s + t_s, one.stop_s + t_s) for t_s in turns_s for one in motion.annotations]
+    made = [span for span in spans if first_s <= span[1] and span[2] <= end_s]
     received: set[int] = set()
     right = 0
-    for one, after_s in made:
-        span = (one.start_s + after_s, one.stop_s + after_s + _LATE_S)
-        own = [
-            k
-            for k, published_one in enumerate(begun)
-            if k not in received and _is(published_one, one, span, epoch_ns)
-        ]
+    for span in made:
+        own = [k for k, one in enumerate(begun) if k not in received and _is(one, span, epoch_ns)]
         right += bool(own)
         received.update(own)
     # One that begin or end of the run cut off was made all the same.
-    cut = [
-        k for k, one in enumerate(begun) if k not in received and _cut(one, motion, epoch_ns, first_s, end_s)
-    ]
+    part = [span for span in spans if span[1] < first_s or span[2] > end_s]
+    left = [one for k, one in enumerate(begun) if k not in received]
+    cut = [one for one in left if any(_is(one, span, epoch_ns) for span in part)]
     out: dict[str, object] = {
         "gestures_right": right,
         "gestures_made": len(made),
@@ -154,23 +144,11 @@ def _label(one: Gesture) -> str:
     return one.kind if one.name == one.kind else f"{one.kind} {one.name}"
 
 
-def _cut(published: Gesture, motion: Gestures, epoch_ns: int, first_s: float, end_s: float) -> bool:
-    """Whether the hand made a gesture only in part between first and last pose."""
-    turns = range(int(end_s // motion.period_s) + 1)
-    spans = (
-        (one, one.start_s + k * motion.period_s, one.stop_s + k * motion.period_s)
-        for one in motion.annotations
-        for k in turns
-    )
-    return any(
-        (start < first_s or stop > end_s) and _is(published, one, (start, stop + _LATE_S), epoch_ns)
-        for one, start, stop in spans
-    )
-
-
-def _is(published: Gesture, made: Annotation, span_s: tuple[float, float], epoch_ns: int) -> bool:
+def _is(published: Gesture, span: tuple[Annotation, float, float], epoch_ns: int) -> bool:
+    """Whether it is that which the hand made from a time to a time [s]."""
+    made, start_s, stop_s = span
     same = (published.kind, published.name) == (made.kind, made.name)
-    return same and span_s[0] <= _seconds_of(published, epoch_ns) <= span_s[1]
+    return same and start_s <= _seconds_of(published, epoch_ns) <= stop_s + _LATE_S
 
 
 def _seconds_of(one: Gesture, epoch_ns: int) -> float:

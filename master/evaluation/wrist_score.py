@@ -143,9 +143,8 @@ def score_cycles(
     Returns:
         cycles; cycles_missed: how many of the truth's are missing; of the laser points as `score_wrist`.
     """
-    at_ns = np.array([message.t_ns for message in messages], np.int64)
+    row = rows_at(truth.t_ns, np.array([message.t_ns for message in messages], np.int64))
     uv = np.array([message.laser_uv for message in messages]).reshape(-1, FINGER_COUNT, 2)
-    row = rows_at(truth.t_ns, at_ns)
     counted = {"cycles": float(len(messages)), "cycles_missed": float((row < 0).sum())}
     return counted | score_laser(at_rows(setup.on_plane(uv), row), truth)
 
@@ -159,9 +158,9 @@ def score_tips(messages: list[WristDetections], truth: WristTruth) -> dict[str, 
         tip_false: Share of the reported tips that are none: the tip of that finger is not seen, or more than 15 px
             away.
     """
-    at_ns = np.array([message.t_ns for message in messages], np.int64)
+    row = rows_at(truth.t_ns, np.array([message.t_ns for message in messages], np.int64))
     uv = np.array([message.tip_uv for message in messages]).reshape(-1, FINGER_COUNT, 2)
-    found = at_rows(uv, rows_at(truth.t_ns, at_ns))
+    found = at_rows(uv, row)
     off = np.linalg.norm(found - truth.tip_uv, axis=2)
     reported = np.isfinite(found).all(axis=2)
     out: dict[str, float] = {}

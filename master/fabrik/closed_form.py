@@ -111,11 +111,7 @@ def _evaluate(chain: ChainArrays, goal: Vector, unknowns: Float, angles: Float, 
     positions, orientations = np.empty((4, 3)), np.empty((3, 9))
     forward(chain, angles, positions, orientations)
     end, sign = vector_at(positions, len(positions) - 1, START), limits.sign
-    x, y, z = (
-        chain.links[ROOT, ROTATION + 1],
-        chain.links[ROOT, ROTATION + 4],
-        chain.links[ROOT, ROTATION + 7],
-    )
+    (_, x, _), (_, y, _), (_, z, _) = matrix_at(chain.links, ROOT, ROTATION)
     axis = (sign * x, sign * y, sign * z)
     put_vector(columns, ROOT, cross(axis, minus(end, vector_at(positions, ROOT, START))))
     for k in range(3):
@@ -156,16 +152,11 @@ def _step(
     determinant = xx * a + xy * b + xz * c
     if not some or not determinant > 0.0:
         return False
-    weights = (
-        dot((a, b, c), left) / determinant,
-        dot((b, d, e), left) / determinant,
-        dot((c, e, f), left) / determinant,
-    )
+    x, y, z = dot((a, b, c), left), dot((b, d, e), left), dot((c, e, f), left)
+    weights = (x / determinant, y / determinant, z / determinant)
     for i in range(4):
-        moved = (
-            dot(vector_at(columns, i, START), weights) if _free(chain, unknowns, left, columns, i) else 0.0
-        )
-        new[i] = unknowns[i] + moved
+        free = _free(chain, unknowns, left, columns, i)
+        new[i] = unknowns[i] + (dot(vector_at(columns, i, START), weights) if free else 0.0)
     return True
 
 
@@ -180,9 +171,7 @@ def _free(chain: ChainArrays, unknowns: Float, left: Vector, columns: Float, i: 
 REACHED_M = 1e-6
 _TOLERANCE_M = 0.05 * REACHED_M
 """A limit passed by less is rounding: the angle is clamped, which moves the point < 0.2 um."""
-_FIRST = constant(0)
 PIP, DIP = constant(1), constant(2)  # links
-"""Rounding of a squared distance at the end of a branch."""
 _PER_BRANCH = 2.0 * pi
 """How much rather the more bent branch is taken: more than any abduction, by which the poses of one are ranked."""
 _SPREAD_OF_STARTS = ((0.1, 0.9), (0.9, 0.1), (0.5, 0.0), (0.5, 1.0), (0.0, 0.5), (1.0, 0.5))
@@ -246,11 +235,8 @@ def distance2_of(chain: ChainArrays, ratio: float, pip: float) -> tuple[float, f
     tip = _flexed(dip, vector_at(chain.links, DIP, BONE))
     rotating = rotate(link_rotation, (0.0, dip_per_pip * tip[2], -dip_per_pip * tip[1]))
     end = plus(rotate(link_rotation, tip), vector_at(chain.links, PIP, BONE))
-    end, rotating, link_rotation = (
-        _flexed(pip, end),
-        _flexed(pip, rotating),
-        matrix_at(chain.links, PIP, ROTATION),
-    )
+    end, rotating = _flexed(pip, end), _flexed(pip, rotating)
+    link_rotation = matrix_at(chain.links, PIP, ROTATION)
     w = plus(rotate(link_rotation, end), vector_at(chain.links, ROOT, BONE))
     return dot(w, w), 2.0 * dot(w, rotate(link_rotation, plus(rotating, (0.0, end[2], -end[1]))))
 
@@ -343,26 +329,16 @@ def _copy(source: Float, out: Float) -> None:
 
 
 @inner
-def _copy_row(rows: Float, row: int, out: Float) -> None:
-    for i in range(4):
-        out[i] = rows[row, i]
-
-
-@inner
 def _keep(initial_angles: Float, penalties: Float, angles: Float, penalty: float) -> None:
     """Keep a pose among the two (rows 1 and 2) that are least beyond what is legal."""
-    row = 1
     if penalty < penalties[0]:
         penalties[1] = penalties[0]
-        for i in range(4):
-            initial_angles[2, i] = initial_angles[1, i]
+        _copy(initial_angles[1], initial_angles[2])
+        penalties[0] = penalty
+        _copy(angles, initial_angles[1])
     elif penalty < penalties[1]:
-        row = 2
-    else:
-        return
-    penalties[row - 1] = penalty
-    for i in range(4):
-        initial_angles[row, i] = angles[i]
+        penalties[1] = penalty
+        _copy(angles, initial_angles[2])
 
 
 @inner
@@ -379,12 +355,8 @@ def _in_plane(chain: ChainArrays, edges: Float, ratio: float, local: Vector, ini
         lateral = _point(chain, pip, ratio * pip)[0]
     w = _point(chain, pip, ratio * pip)
     f = hinge_fit(chain.spans[1, 0], chain.spans[1, 1], (-1.0, 0.0, 0.0), w, (x, y, z), 0.0)
-    initial_angles[0, 0], initial_angles[0, 1], initial_angles[0, 2], initial_angles[0, 3] = (
-        a,
-        f,
-        pip,
-        ratio * pip,
-    )
+    initial_angles[0, 0], initial_angles[0, 1] = a, f
+    initial_angles[0, 2], initial_angles[0, 3] = pip, ratio * pip
 
 
 @kernel
@@ -421,11 +393,9 @@ def _start(
     """Write start (4,): a seed; for a free DIP also the last pose, and pairs."""
     pair = start - len(initial_angles) - 1
     if start < len(initial_angles):
-        _copy_row(initial_angles, start, angles)
+        _copy(initial_angles[start], angles)
     elif pair < 0:
-        _copy_row(initial_angles, _FIRST, angles)
-        if _known(warm_start):
-            _copy(warm_start, angles)
+        _copy(warm_start if _known(warm_start) else initial_angles[0], angles)
     else:
         pip_share, dip_share = _SPREAD_OF_STARTS[pair // 2]
         pip = chain.spans[2, 0] + pip_share * (chain.spans[2, 1] - chain.spans[2, 0])

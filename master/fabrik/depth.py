@@ -25,7 +25,6 @@ from common.geometry.camera_model import CameraModel
 
 PARALLEL_RAD = np.radians(3.0)
 """Most by which two cameras may be turned against each other where depth is a law of raw disparity."""
-"""Most by which their focal lengths may differ, and the slope of their baseline against the image rows."""
 LAW_RESIDUAL = 0.02
 """Most by which a law of depth and the cameras' places may differ where both are used."""
 _DEPTHS_M = (0.35, 1.0)

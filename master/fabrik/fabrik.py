@@ -39,7 +39,6 @@ from master.fabrik.joints import (
     ROTATION,
     START,
     WORLD,
-    Angles,
     ChainArrays,
     Hinge,
     Joint,
@@ -75,9 +74,6 @@ from master.fabrik.linear_algebra import (
     rotation_about,
     transposed,
 )
-
-Pose = tuple[Angles, ...]
-"""Angles of every joint [rad]: one of a hinge, abduction and flexion of a rotor."""
 
 _SEARCH_STARTS = (1.0, 0.5, 0.0)
 
@@ -126,38 +122,18 @@ class Chain:
         return tuple(length(link.bone) for link in self.links)
 
     @property
-    def spans(self) -> tuple[Pair, ...]:
-        """Low and high of every angle [rad]; the abduction's where nothing narrows it."""
-        return tuple((low, high) for low, high in self.arrays.spans.tolist())
+    def spans(self) -> Float:
+        """Low and high (n, 2) of every angle [rad], the abduction not narrowed."""
+        return self.arrays.spans
 
-    def flat(self, pose: Pose) -> Float:
-        """Angles (n,) [rad] of a pose.
+    def clamp(self, angles_rad: Float) -> Float:
+        """The nearest legal angles (n,) [rad], coupling obeyed."""
+        legal = np.array(angles_rad, np.float64)
+        clamp_angles(self.arrays, legal)
+        return legal
 
-        Raises:
-            ValueError: A joint has too many angles, or too few.
-        """
-        for link, angles in zip(self.links, pose, strict=True):
-            if len(angles) != _count(link.joint):
-                raise ValueError(f"{len(angles)} angles for a joint that has {_count(link.joint)}")
-        return np.array([angle for angles in pose for angle in angles], np.float64)
-
-    def pose(self, angles_rad: Float) -> Pose:
-        """Angles (n,) [rad] joint by joint."""
-        rest = iter(angles_rad.tolist())
-        return tuple(tuple(next(rest) for _ in range(_count(link.joint))) for link in self.links)
-
-    def clamp(self, pose: Pose) -> Pose:
-        """The nearest legal pose, coupling obeyed."""
-        angles = self.flat(pose)
-        clamp_angles(self.arrays, angles)
-        return self.pose(angles)
-
-    def forward(self, pose: Pose) -> tuple[Float, Float]:
+    def forward(self, angles_rad: Float) -> tuple[Float, Float]:
         """Joint positions (N + 1, 3) [m] and link orientations (N, 3, 3), root frame."""
-        return self.forward_flat(self.flat(pose))
-
-    def forward_flat(self, angles_rad: Float) -> tuple[Float, Float]:
-        """As `forward`, from angles (n,) [rad]."""
         positions, orientations = np.zeros((len(self.links) + 1, 3)), np.zeros((len(self.links), 9))
         forward(self.arrays, angles_rad, positions, orientations)
         return positions, orientations.reshape(-1, 3, 3)
@@ -172,9 +148,7 @@ def _nearest_from(chain: Chain, share: float) -> float:
     """Least |end - root| [m] from joints at a share of their range."""
 
     def distance(angles: Float) -> float:
-        legal = angles.copy()
-        clamp_angles(chain.arrays, legal)
-        return length(end_of(chain.arrays, legal))
+        return length(end_of(chain.arrays, chain.clamp(angles)))
 
     low, high = chain.arrays.spans.T
     first = _count(chain.links[0].joint)
@@ -230,11 +204,8 @@ def _count(joint: Joint) -> int:
 @inner
 def aim(chain: ChainArrays, end: Vector, goal: Vector, angles: Float) -> None:
     """Turn the first joint so that the end lies towards the goal."""
-    limits, link_rotation, now = (
-        limits_of(chain, ROOT),
-        matrix_at(chain.links, ROOT, ROTATION),
-        angles_of(chain, angles, ROOT),
-    )
+    limits, now = limits_of(chain, ROOT), angles_of(chain, angles, ROOT)
+    link_rotation = matrix_at(chain.links, ROOT, ROTATION)
     arm = rotate_back(rotation(limits, now), rotate_back(link_rotation, end))
     put_angles(chain, angles, ROOT, fit(limits, arm, rotate_back(link_rotation, goal), now))
 
@@ -252,11 +223,8 @@ def backward_pass(
     place = minus(place, rotate(behind, vector_at(chain.links, last, BONE)))
     put_vector(places, last, place)
     for k in range(last - 1, -1, -1):
-        wanted, now, bone = (
-            minus(place, vector_at(positions, k, START)),
-            matrix_at(orientations, k, START),
-            vector_at(chain.links, k, BONE),
-        )
+        wanted, bone = minus(place, vector_at(positions, k, START)), vector_at(chain.links, k, BONE)
+        now = matrix_at(orientations, k, START)
         if chain.joints[k, WORLD] or chain.joints[k + 1, WORLD]:
             here = _pointed(chain, k, now, angles, wanted)
         elif chain.joints[k + 1, KIND] == HINGE:
@@ -318,11 +286,8 @@ def forward_pass(
     put_vector(positions, ROOT, place)
     parent = matrix_at(chain.links, ROOT, ROTATION)
     for k in range(len(chain.joints)):
-        limits, bone, frame = (
-            limits_of(chain, k),
-            vector_at(chain.links, k, BONE),
-            rest_frame(chain, k, parent),
-        )
+        limits, bone = limits_of(chain, k), vector_at(chain.links, k, BONE)
+        frame = rest_frame(chain, k, parent)
         if k == chain.follower:
             follow(chain, angles)
         else:
@@ -352,7 +317,7 @@ class ChainResult(NamedTuple):
 
     positions: Float  # joints, root first, and the end (N + 1, 3) [m]
     orientations: Float  # link frames (N, 3, 3) in the frame of the target
-    angles: Pose  # of every joint [rad], legal
+    angles: Float  # (n,) of every joint [rad], legal: of a rotor abduction and flexion
     residual_m: float  # distance of the end to the target
     iterations: int  # of all attempts
     reached: bool  # residual within the tolerance
@@ -391,32 +356,38 @@ class Fabrik:
     def solve(
         self,
         target: Vector,
-        initial: Pose | None = None,
+        initial: Float | None = None,
         root: Vector = (0.0, 0.0, 0.0),
         frame: Matrix = IDENTITY,
     ) -> ChainResult:
         """Bring the chain's end to the target; return the best legal pose found.
 
-        `target` [m], in the frame the result shall be in; NaN: so is the pose. `initial`: angles to start
-        from, clamped; None: the rest pose. `root` [m], `frame`: of the first joint.
+        `target` [m], in the frame the result shall be in; NaN: so is the pose. `initial`: angles (n,) [rad] to
+        start from, clamped; None: the rest pose. `root` [m], `frame`: of the first joint.
+
+        Raises:
+            ValueError: There are too many angles, or too few.
         """
         goal = rotate_back(frame, minus(target, root))
-        reach = self._reach(goal)
-        chain = self.chain
-        angles = np.zeros(len(chain.arrays.spans)) if initial is None else chain.flat(initial)
+        reach, chain = self._reach(goal), self.chain
+        n, count = len(chain.spans), len(chain.links)
+        angles = np.zeros(n) if initial is None else np.array(initial, np.float64)
+        if len(angles) != n:
+            raise ValueError(f"{len(angles)} angles for a chain that has {n}")
         if reach is Reach.NOT_SEEN:
-            return self._not_seen(chain.pose(np.full_like(angles, np.nan)))
+            nowhere = np.full((count + 1, 3), np.nan), np.full((count, 3, 3), np.nan), np.full(n, np.nan)
+            return ChainResult(*nowhere, float("nan"), 0, False, reach, False)
         restarts = self.restarts if reach is Reach.WITHIN else 0
         residual, iterations = solve_chain(
             chain.arrays, goal, self.tolerance_m, self.max_iterations, restarts, angles
         )
-        positions, orientations = chain.forward_flat(angles)
+        positions, orientations = chain.forward(angles)
         rotation = np.array(frame)
         shortest_m = 1e-9
         return ChainResult(
             positions=positions @ rotation.T + np.array(root),
             orientations=rotation @ orientations,
-            angles=chain.pose(angles),
+            angles=angles,
             residual_m=residual,
             iterations=iterations,
             reached=residual <= self.tolerance_m,
@@ -431,11 +402,6 @@ class Fabrik:
         if distance > self.farthest_m + self.tolerance_m:
             return Reach.TOO_FAR
         return Reach.TOO_NEAR if distance < self.nearest_m - self.tolerance_m else Reach.WITHIN
-
-    def _not_seen(self, nowhere: Pose) -> ChainResult:
-        count = len(self.chain.links)
-        positions, orientations = np.full((count + 1, 3), np.nan), np.full((count, 3, 3), np.nan)
-        return ChainResult(positions, orientations, nowhere, float("nan"), 0, False, Reach.NOT_SEEN, False)
 
 
 @kernel

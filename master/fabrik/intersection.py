@@ -342,13 +342,13 @@ class Association:
     dropped: Bool  # (M,) nothing fits, or it is ambiguous
 
 
-def among(others_m: Float, on_hand: Int, settings: GateSettings = SETTINGS) -> Prior:
+def among(others_m: Float, on_hand: Int) -> Prior:
     """Expect markers `on_hand` around the others (M, 3); no hand is solved."""
     points, triangulated = np.full(others_m.shape, np.nan), others_m[on_hand]
     triangulated = triangulated[np.isfinite(triangulated[:, 0])]
     if len(triangulated):
         points[on_hand] = np.median(triangulated, axis=0)
-    return Prior(points, np.tile(settings.spread_m**2 * np.eye(3), (len(points), 1, 1)))
+    return Prior(points, np.tile(SETTINGS.spread_m**2 * np.eye(3), (len(points), 1, 1)))
 
 
 def associate(
@@ -358,7 +358,6 @@ def associate(
     hand: Prior,
     past: tuple[Float, Float],
     rays_px: float = 0.0,
-    settings: GateSettings = SETTINGS,
 ) -> Association:
     """Choose for every marker that has an alternative; pass on the others.
 
@@ -375,8 +374,8 @@ def associate(
     out = Association(first_uv.copy(), first_sigma.copy(), area.copy(), taken, taken.copy())
     for m in np.flatnonzero(alternative.any(axis=0)):
         where = np.flatnonzero(alternative[:, m])
-        out.uv[where[settings.most_cameras :], m] = np.nan
-        where = where[: settings.most_cameras]
+        out.uv[where[SETTINGS.most_cameras :], m] = np.nan
+        where = where[: SETTINGS.most_cameras]
         # (K, r) whether the second place is taken in each such camera; the first combination: nowhere.
         second = np.array(list(product((False, True), repeat=len(where))))
         uv = np.repeat(out.uv[:, m : m + 1], len(second), axis=1)
@@ -384,11 +383,11 @@ def associate(
         for c, use in zip(where, second.T, strict=True):
             uv[c, use], sigma_px[c, use] = alternatives[0][c, m], alternatives[1][c, m]
         age_s = past[1][m]
-        moved = (settings.place_m + settings.speed_m_s * age_s) ** 2 * np.eye(3)
-        was = past[0][m] if age_s <= settings.forget_s else np.full(3, np.nan)
-        model = settings.model_m**2 * np.eye(3)
+        moved = (SETTINGS.place_m + SETTINGS.speed_m_s * age_s) ** 2 * np.eye(3)
+        was = past[0][m] if age_s <= SETTINGS.forget_s else np.full(3, np.nan)
+        model = SETTINGS.model_m**2 * np.eye(3)
         priors = Prior(hand.points_m[m], hand.cov_m2[m] + model), Prior(was, moved)
-        k = _best(cameras, uv, sigma_px, second.sum(axis=1), priors, rays_px, settings)
+        k = _best(cameras, uv, sigma_px, second.sum(axis=1), priors, rays_px)
         out.dropped[m], out.taken[m] = k is None, k is not None and k > 0
         out.uv[:, m] = np.nan if k is None else uv[:, k]
         out.sigma_px[:, m] = np.nan if k is None else sigma_px[:, k]
@@ -403,7 +402,6 @@ def _best(
     overruled: Int,
     priors: tuple[Prior, Prior],
     rays_px: float,
-    settings: GateSettings,
 ) -> int | None:
     """Return which of K combinations is the marker, 0: first choices; None: none.
 
@@ -420,16 +418,16 @@ def _best(
     else:
         found = triangulate(cameras, uv, sigma_px, rays_px)
         places, cov, cost = found.points_m, found.cov_m2, found.chi_square
-        fits, same = np.isfinite(places[:, 0]) & ~found.outliers, settings.same_m
+        fits, same = np.isfinite(places[:, 0]) & ~found.outliers, SETTINGS.same_m
     from_hand, from_past = (_distances(places, cov, *prior) for prior in priors)
-    farthest = float(chdtri(places.shape[1], settings.false_alarm))
+    farthest = float(chdtri(places.shape[1], SETTINGS.false_alarm))
     fits = fits & (from_hand <= farthest) & ((from_past <= farthest) | (overruled == 0))
     if not fits.any():
         return None
-    cost = cost + from_hand + np.minimum(from_past, settings.past_most) + settings.overrule * overruled
+    cost = cost + from_hand + np.minimum(from_past, SETTINGS.past_most) + SETTINGS.overrule * overruled
     cost = np.where(fits, cost, np.inf)
     best = int(np.argmin(cost))
-    near = (cost <= cost[best] + settings.overrule) & (np.linalg.norm(places - places[best], axis=1) > same)
+    near = (cost <= cost[best] + SETTINGS.overrule) & (np.linalg.norm(places - places[best], axis=1) > same)
     return None if best > 0 and near[overruled > 0].any() else best
 
 

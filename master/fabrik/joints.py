@@ -72,7 +72,10 @@ def rotation(limits: Limits, angles: Pair) -> Matrix:
 
 @kernel
 def clamp(limits: Limits, angles: Pair) -> Pair:
-    """Legal angles nearest to the given ones [rad]; as of `Hinge` and `Rotor`."""
+    """Legal angles nearest to the given ones [rad].
+
+    A hinge goes round the shorter way; a cone is entered on the line to its rest pose.
+    """
     if limits.kind == HINGE:
         return _nearer_end(limits.low, limits.high, angles[0]), 0.0
     a, f = angles
@@ -91,7 +94,12 @@ def clamp(limits: Limits, angles: Pair) -> Pair:
 
 @kernel
 def fit(limits: Limits, bone: Vector, direction: Vector, now: Pair) -> Pair:
-    """Legal angles [rad] that bring Q bone to `direction`; as of `Hinge`, `Rotor`."""
+    """Legal angles [rad] that bring a bone nearest to `direction`, joint's frame.
+
+    `bone` [m], in the joint's own frame; `direction` of any length; on a hinge's axis or zero: `now` stays.
+    Where two exact pairs of a rotor are legal (bones out of plane, near the pole of the abduction) the one
+    nearer to `now` is taken.
+    """
     if limits.kind == HINGE:
         return hinge_fit(limits.low, limits.high, limits.axis, bone, direction, now[0]), 0.0
     reach, wanted = length(bone), length(direction)
@@ -125,7 +133,7 @@ def _legalised(limits: Limits, pair: Pair, now: Pair) -> tuple[Pair, float, floa
 
 @inner
 def hinge_fit(low: float, high: float, axis: Vector, bone: Vector, direction: Vector, now: float) -> float:
-    """Angle that brings R(axis, angle) bone nearest to `direction`; as of `Hinge`."""
+    """Angle that brings R(axis, angle) bone nearest to `direction`; as of `fit`."""
     y = dot(direction, cross(axis, bone))
     x = dot(direction, bone) - dot(axis, bone) * dot(direction, axis)
     if hypot(x, y) <= 1e-12 * length(bone) * length(direction):
@@ -170,10 +178,10 @@ def swing_and_flex(bone: Vector, target: Vector, rest: Matrix, sign: float) -> t
     y = c + rho k cos(f - f0). The abduction then turns x, z onto the target's. A y out of reach is clamped.
     """
     y_row = rest[1]
-    even = y_row[1] * bone[1] + y_row[2] * bone[2]
-    odd = y_row[1] * bone[2] - y_row[2] * bone[1]
-    amplitude = hypot(even, odd)
-    middle = atan2(odd, even)
+    along = y_row[1] * bone[1] + y_row[2] * bone[2]
+    across = y_row[1] * bone[2] - y_row[2] * bone[1]
+    amplitude = hypot(along, across)
+    middle = atan2(across, along)
     ratio = (target[1] - y_row[0] * bone[0]) / amplitude if amplitude > _TINY else 1.0
     half = acos(min(max(ratio, -1.0), 1.0))
     return (_swung(bone, target, rest, sign, middle + half), _swung(bone, target, rest, sign, middle - half))
@@ -188,8 +196,6 @@ def _swung(bone: Vector, target: Vector, rest: Matrix, sign: float, f: float) ->
     x, z = dot(rest[0], flexed), dot(rest[2], flexed)
     return sign * atan2(target[0] * z - target[2] * x, target[0] * x + target[2] * z), f
 
-
-Angles = tuple[float, ...]
 
 _FLEXION_AXIS: Vector = (-1.0, 0.0, 0.0)
 
@@ -214,21 +220,6 @@ class Hinge:
         return Limits(
             HINGE, float(self.low_rad), float(self.high_rad), 0.0, 0.0, 1.0, 1.0, self.axis, IDENTITY
         )
-
-    def rotation(self, angles: Angles) -> Matrix:
-        """Rotation Q of one angle [rad]."""
-        return rotation(self.limits, (angles[0], 0.0))
-
-    def clamp(self, angles: Angles) -> Angles:
-        """The nearest legal angle, going round the shorter way."""
-        return clamp(self.limits, (angles[0], 0.0))[:1]
-
-    def fit(self, bone: Vector, direction: Vector, now: Angles) -> Angles:
-        """Legal angle that brings Q bone nearest to `direction`, in the joint's frame.
-
-        `bone` [m], in the joint's own frame; `direction` of any length; on the axis or zero: `now` stays.
-        """
-        return fit(self.limits, bone, direction, (now[0], 0.0))[:1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,30 +257,6 @@ class Rotor:
             float, (*self.abduction_rad, *self.flexion_rad, self.spread_at_full_flexion, self.sign)
         )
         return Limits(kind, low, high, f_low, f_high, left, sign, _FLEXION_AXIS, self.rest)
-
-    def rotation(self, angles: Angles) -> Matrix:
-        """Rotation Q of (abduction, flexion) [rad]."""
-        return rotation(self.limits, (angles[0], angles[1]))
-
-    def clamp(self, angles: Angles) -> Pair:
-        """A legal pair near the wanted one; in a cone, on the line to the rest pose."""
-        return clamp(self.limits, (angles[0], angles[1]))
-
-    def abduction_span(self, flexion_rad: float) -> Pair:
-        """Low and high of the abduction at one flexion [rad]."""
-        return abduction_span(self.limits, flexion_rad)
-
-    def narrowing(self, flexion_rad: float) -> Pair:
-        """Share of the abduction range left at a flexion [rad], and its slope [1/rad]."""
-        return narrowing(self.limits, flexion_rad)
-
-    def fit(self, bone: Vector, direction: Vector, now: Angles) -> Pair:
-        """Legal (abduction, flexion) that bring Q bone to `direction`, or near it.
-
-        Where two exact pairs are legal (bones out of plane, near the pole of the abduction) the one nearer to
-        `now` is taken. Arguments as of `Hinge.fit`.
-        """
-        return fit(self.limits, bone, direction, (now[0], now[1]))
 
 
 Joint = Hinge | Rotor

@@ -52,6 +52,17 @@ from master.fabrik.intersection import (
 )
 
 
+class _Rig(NamedTuple):
+    """What is the same at every epoch, and scratch."""
+
+    cameras: CameraArrays
+    caps: CapTables
+    rays_px: float  # standard deviation per axis that the calibration leaves
+    limits: Float  # (C + 1,) most chi-square by the number of cameras
+    rays: Rays
+    views: Views
+
+
 class _Hand(NamedTuple):
     """Directions of the K caps."""
 
@@ -64,28 +75,31 @@ class _Hand(NamedTuple):
     process_noise: Float  # (K,) tilt growth to a fit that starts there, as a share of its variance
 
 
+class _Placed(NamedTuple):
+    """As of `RayPositions`, which is made of it."""
+
+    points: Float
+    cov: Float
+    noise: Float
+    outliers: Bool
+    rejected: Bool
+    uv: Float
+    variance: Float
+    own: Float
+
+
 @inner
 def _covariance(
-    cameras: CameraArrays,
-    caps: CapTables,
-    row: int,
-    count: int,
-    shared: float,
-    rays: Rays,
-    views: Views,
-    process_noise: float,
-    cov: Float,
-    own: Float,
+    rig: _Rig, row: int, count: int, shared: float, process_noise: float, cov: Float, own: Float
 ) -> None:
     """Write the covariance (3, 3) of a refined point, and its part unseen by rays."""
-    correction_jacobian_m, gain = views.correction_jacobian_m, views.gain
-    step, both = views.step, views.both  # of the point by a common step; gain gain'
+    cameras, rays, bias, gain = rig.cameras, rig.rays, rig.views.bias, rig.views.gain
+    moved, step, both = rig.views.correction_jacobian_m, rig.views.step, rig.views.both
     for i in range(3):
         for j in range(3):
-            step[i, j] = both[i, j] = 0.0
-    for t in range(count):
-        for i in range(3):
-            correction_jacobian_m[t, i] = 0.0
+            step[i, j] = both[i, j] = 0.0  # of the point by a common step; gain gain'
+        for t in range(count):
+            moved[t, i] = 0.0
     for c in range(rays.weight.shape[0]):
         if rays.weight[c] == 0.0 or not project(cameras, c, rays.point, rays.seen, rays.J):
             continue
@@ -96,45 +110,40 @@ def _covariance(
                     gain[i, axis] += rays.weight[c] * rays.cov[i, k] * rays.J[axis, k]
         for i in range(3):
             for t in range(count):
-                correction_jacobian_m[t, i] += (
-                    gain[i, 0] * views.bias[t, c, 0] + gain[i, 1] * views.bias[t, c, 1]
-                )
+                moved[t, i] += gain[i, 0] * bias[t, c, 0] + gain[i, 1] * bias[t, c, 1]
             for j in range(3):
                 step[i, j] += gain[i, 0] * cameras.R[c, 0, j] + gain[i, 1] * cameras.R[c, 1, j]
                 both[i, j] += gain[i, 0] * gain[j, 0] + gain[i, 1] * gain[j, 1]
     for i in range(3):
         for j in range(3):
             common = step[i, 0] * step[j, 0] + step[i, 1] * step[j, 1] + step[i, 2] * step[j, 2] - both[i, j]
-            shape = CAPS.radius_share**2 * correction_jacobian_m[0, i] * correction_jacobian_m[0, j]
+            shape = CAPS.radius_share**2 * moved[0, i] * moved[0, j]
             shape += CAPS.relief_m**2 if row < 0 and i == j else 0.0
             tilt = 0.0
             for t in range(1, count):
-                tilt += (
-                    (correction_jacobian_m[t, i] - correction_jacobian_m[0, i])
-                    * (correction_jacobian_m[t, j] - correction_jacobian_m[0, j])
-                    / (count - 1)
-                )
+                tilt += (moved[t, i] - moved[0, i]) * (moved[t, j] - moved[0, j]) / (count - 1)
             cov[i, j] = rays.cov[i, j] + shared * common + shape + tilt
             own[i, j] = shape + (1.0 + process_noise) * tilt
 
 
 @inner
-def _correct(
-    cameras: CameraArrays, caps: CapTables, hand: _Hand, rays_px: float, row: int, rays: Rays, views: Views
-) -> tuple[int, float]:
+def _correct(rig: _Rig, hand: _Hand, observed: Float, m: int) -> tuple[int, float]:
     """Take the caps' bias from the centroids and weigh them by what is hidden.
 
     Returns directions that the cap may have, and the variance [px^2] that all cameras have in common.
     """
+    rays, views, row = rig.rays, rig.views, rig.caps.row[m]
+    for c in range(rays.weight.shape[0]):
+        views.area[c] = observed[c, m, 3] if rays.weight[c] > 0.0 else np.nan
     count = TILTED if hand.known else ANY
     if row < 0:
         count = 1
     elif hand.known:
         tilted(row, hand.R, hand.tilt_rad2, hand.rotation_rad2, views.aim)
     else:
-        any_direction(cameras, rays.point, views.aim)
-    appearance(cameras, caps, row, count, rays, views)
-    hidden_part(caps, row, views.area, views.scale, views.whole, count, views.hidden)
+        any_direction(rig.cameras, rays.point, views.aim)
+    appearance(rig.cameras, rig.caps, row, count, rays, views)
+    hidden_part(rig.caps, row, views.area, views.scale, views.whole, count, views.hidden)
     shared = RAYS.common_px * RAYS.common_px
     occluded = False
     for c in range(rays.weight.shape[0]):
@@ -147,141 +156,84 @@ def _correct(
         rays.uv[c, 0] -= views.bias[0, c, 0]
         rays.uv[c, 1] -= views.bias[0, c, 1]
         rays.variance[c] += views.hidden[c]
-        rays.weight[c] = 1.0 / (rays.variance[c] + rays_px * rays_px)
+        rays.weight[c] = 1.0 / (rays.variance[c] + rig.rays_px * rig.rays_px)
     return count, 0.0 if occluded else RAYS.common * shared
 
 
 @inner
-def _place(
-    cameras: CameraArrays,
-    caps: CapTables,
-    hand: _Hand,
-    rays_px: float,
-    observed: Float,
-    rejected: Bool,
-    m: int,
-    rays: Rays,
-    views: Views,
-) -> tuple[int, bool, int, float]:
+def _place(rig: _Rig, hand: _Hand, observed: Float, rejected: Bool, m: int) -> tuple[int, bool, int, float]:
     """Triangulate marker m by the cameras that are not rejected.
 
-    Returns how many see it; whether its point is determined; and as `_correct`.
+    Returns how many see it; whether their rays meet; and as `_correct`.
     """
-    seen = observe(cameras, observed, rejected, rays_px, m, rays)
-    if seen < 2 or not linear(cameras, rays):
+    seen = observe(rig.cameras, observed, rejected, rig.rays_px, m, rig.rays)
+    if seen < 2 or not linear(rig.cameras, rig.rays):
         return seen, False, 1, 0.0
-    for c in range(observed.shape[0]):
-        views.area[c] = observed[c, m, 3] if rays.weight[c] > 0.0 else np.nan
-    count, shared = _correct(cameras, caps, hand, rays_px, caps.row[m], rays, views)
-    return seen, refine(cameras, rays), count, shared
+    count, shared = _correct(rig, hand, observed, m)
+    meets = refine(rig.cameras, rig.rays) and chi_square(rig.rays) <= rig.limits[seen]
+    return seen, meets, count, shared
 
 
 @inner
-def _monocular(
-    cameras: CameraArrays,
-    caps: CapTables,
-    hand: _Hand,
-    rays_px: float,
-    observed: Float,
-    m: int,
-    rays: Rays,
-    views: Views,
-) -> None:
+def _monocular(rig: _Rig, hand: _Hand, observed: Float, m: int) -> None:
     """Take a cap's bias, by the hand, from a single camera; its tilt is own error."""
-    row = caps.row[m]
+    rays, bias = rig.rays, rig.views.bias
     for i in range(3):
-        rays.point[i] = hand.at[row, i]
-    for c in range(rays.weight.shape[0]):
-        views.area[c] = observed[c, m, 3] if rays.weight[c] > 0.0 else np.nan
-    count, _ = _correct(cameras, caps, hand, rays_px, row, rays, views)
+        rays.point[i] = hand.at[rig.caps.row[m], i]
+    count, _ = _correct(rig, hand, observed, m)
     for c in range(rays.weight.shape[0]):
         for t in range(1, count):
             for axis in range(2):
-                off = views.bias[t, c, axis] - views.bias[0, c, axis]
+                off = bias[t, c, axis] - bias[0, c, axis]
                 rays.variance[c] += off * off / (2.0 * (count - 1))
 
 
 @kernel
-def correct_centres(
-    cameras: CameraArrays,
-    caps: CapTables,
-    rays_px: float,
-    limits: Float,
-    known: bool,
-    as_seen: bool,
-    R: Float,
-    tilt_rad2: Float,
-    rotation_rad2: float,
-    at: Float,
-    process_noise: Float,
-    observed: Float,
-    rays: Rays,
-    views: Views,
-    points: Float,
-    cov: Float,
-    noise: Float,
-    outliers: Bool,
-    rejected: Bool,
-    uv: Float,
-    variance: Float,
-    own: Float,
-) -> None:
+def correct_centres(rig: _Rig, hand: _Hand, observed: Float, out: _Placed) -> None:
     """Locate M markers with covariance.
 
-    Args:
-        rays_px: Standard deviation per axis that the calibration leaves.
-        limits: (C + 1,) most chi-square by the number of cameras.
-        known, as_seen, R, tilt_rad2, rotation_rad2, at, process_noise: As of `_Hand`.
-        observed: (C, M, 4) u, v, sigma [px], area [px^2]; NaN: not seen.
-        points, cov, noise, outliers, rejected: Written as of `MarkerPositions`.
-        uv, variance, own: Written, as of `RayPositions`.
+    `observed` (C, M, 4): u, v, sigma [px], area [px^2]; NaN: not seen. `out` is written.
     """
-    hand = _Hand(known, as_seen, R, tilt_rad2, rotation_rad2, at, process_noise)
+    cameras, rays, rejected = rig.cameras, rig.rays, out.rejected
     for m in range(observed.shape[1]):
         for c in range(observed.shape[0]):
             rejected[c, m] = False
-        seen, triangulated, count, shared = _place(
-            cameras, caps, hand, rays_px, observed, rejected, m, rays, views
-        )
-        meets = triangulated and chi_square(rays) <= limits[seen]
+        seen, meets, count, shared = _place(rig, hand, observed, rejected, m)
         fewest = 3  # cameras of which one may be an outlier
         if seen >= fewest and not meets:
-            outlying = outlier(cameras, limits[seen - 1], rays)
+            outlying = outlier(cameras, rig.limits[seen - 1], rays)
             if outlying >= 0:
                 rejected[outlying, m] = True
-                seen, triangulated, count, shared = _place(
-                    cameras, caps, hand, rays_px, observed, rejected, m, rays, views
-                )
-                meets = triangulated and chi_square(rays) <= limits[seen]
+                seen, meets, count, shared = _place(rig, hand, observed, rejected, m)
                 rejected[outlying, m] = meets
-        outliers[m] = seen >= 2 and not meets
-        row = caps.row[m]
+        out.outliers[m] = seen >= 2 and not meets
+        row, cov, own = rig.caps.row[m], out.cov[m], out.own[m]
         for i in range(3):
             for j in range(3):
-                own[m, i, j] = 0.0
+                own[i, j] = 0.0
         if meets:
-            much = float(process_noise[row]) if known and row >= 0 else 0.0
-            _covariance(cameras, caps, row, count, shared, rays, views, much, cov[m], own[m])
-        elif seen == 1 and known and row >= 0:
-            _monocular(cameras, caps, hand, rays_px, observed, m, rays, views)
+            much = float(hand.process_noise[row]) if hand.known and row >= 0 else 0.0
+            _covariance(rig, row, count, shared, much, cov, own)
+        elif seen == 1 and hand.known and row >= 0:
+            _monocular(rig, hand, observed, m)
         common = 0.0
         for c in range(observed.shape[0]):
-            used = rays.weight[c] > 0.0 and not outliers[m]
-            own_variance = rays.variance[c] + rays_px * rays_px - (shared if meets else 0.0)
-            variance[c, m] = own_variance if used else np.nan
-            uv[c, m, 0], uv[c, m, 1] = rays.uv[c, 0], rays.uv[c, 1]
+            used = rays.weight[c] > 0.0 and not out.outliers[m]
+            own_variance = rays.variance[c] + rig.rays_px * rig.rays_px - (shared if meets else 0.0)
+            out.variance[c, m] = own_variance if used else np.nan
+            out.uv[c, m, 0], out.uv[c, m, 1] = rays.uv[c, 0], rays.uv[c, 1]
             if meets and used:
                 squared = 0.0
                 for i in range(3):
                     squared += (rays.point[i] - cameras.centre[c, i]) ** 2
                 common += shared * squared / (cameras.scale[c] ** 2 * seen)
         for i in range(3):
-            own[m, i, i] += common
-            points[m, i] = rays.point[i] if meets else np.nan
+            own[i, i] += common
+            out.points[m, i] = rays.point[i] if meets else np.nan
             for j in range(3):
-                noise[m, i, j] = rays.cov[i, j] if meets else np.nan
+                out.noise[m, i, j] = rays.cov[i, j] if meets else np.nan
                 if not meets:
-                    cov[m, i, j] = np.nan
+                    cov[i, j] = np.nan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -310,9 +262,9 @@ class RayTriangulator:
         """
         if len(cameras) < 2:
             raise ValueError(f"triangulation needs two cameras or more, not {len(cameras)}")
-        self._cameras, self._caps, self._rays_px = CameraArrays.of(cameras), caps, rays_px
-        self._limits = limits_of(len(cameras))
-        self._rays, self._views = Rays.empty(len(cameras)), Views.empty(len(cameras))
+        count = len(cameras)
+        scratch = Rays.empty(count), Views.empty(count)
+        self._rig = _Rig(CameraArrays.of(cameras), caps, rays_px, limits_of(count), *scratch)
         self._unknown = np.zeros((len(caps.radius_m), 3, 3))
         self._correct_centres: Callable[..., None] | None = None
 
@@ -327,33 +279,29 @@ class RayTriangulator:
         as_seen: bool = False,
     ) -> "RayPositions":
         """As `master.fabrik.triangulate.DepthTriangulator`, by the rays of all cameras."""
-        cameras, count = uv.shape[:2]
-        observed = np.empty((cameras, count, 4))
+        shape, count, caps = uv.shape[:2], uv.shape[1], self._rig.caps
+        observed = np.empty((*shape, 4))
         observed[..., :2], observed[..., 2], observed[..., 3] = uv, sigma_px, area_px2
         R = tilt = self._unknown
-        at, process_noise = self._unknown[:, 0], self._unknown[:, 0, 0]
+        at, process_noise, rotation_rad2 = R[:, 0], R[:, 0, 0], (CAPS.rotation_rad_s * age_s) ** 2
         if hand is not None:
-            R, tilt = hand.joints.rotation[self._caps.joint], hand.tilt_cov_rad2[self._caps.finger]
-            at = hand.joints.position_m[self._caps.joint]
+            R, tilt = hand.joints.rotation[caps.joint], hand.tilt_cov_rad2[caps.finger]
+            at = hand.joints.position_m[caps.joint]
             # A fit assumes that fingers move as fast as its priors allow. Given less than it assumes itself, it
             # would follow its own error, and finger and cap would drag each other away.
-            rotation_rad2 = 2.0 * (CAPS.rotation_rad_s * age_s) ** 2
-            grown = hand.tilt_process_noise_rad2_s2[self._caps.finger] * age_s**2 - rotation_rad2
-            ours = tilt[:, 0, 0] + tilt[:, 1, 1] + tilt[:, 2, 2] + rotation_rad2
+            grown = hand.tilt_process_noise_rad2_s2[caps.finger] * age_s**2 - 2.0 * rotation_rad2
+            ours = tilt[:, 0, 0] + tilt[:, 1, 1] + tilt[:, 2, 2] + 2.0 * rotation_rad2
             process_noise = np.maximum(grown, 0.0) / np.maximum(ours, 1e-12)
-        places = np.empty((count, 3)), np.empty((count, 3, 3)), np.empty((count, 3, 3))
-        flags = np.empty(count, np.bool_), np.empty((cameras, count), np.bool_)
-        pixels = np.empty((cameras, count, 2)), np.empty((cameras, count)), np.empty((count, 3, 3))
-        out = *places, *flags, *pixels
-        rig = self._cameras, self._caps, self._rays_px, self._limits
-        directions = hand is not None, as_seen, R, tilt, (CAPS.rotation_rad_s * age_s) ** 2
         about = np.ascontiguousarray(at), np.ascontiguousarray(process_noise)
-        arguments = *rig, *directions, *about, observed, self._rays, self._views, *out
+        directions = _Hand(hand is not None, as_seen, R, tilt, rotation_rad2, *about)
+        places = np.empty((count, 3)), np.empty((count, 3, 3)), np.empty((count, 3, 3))
+        flags = np.empty(count, np.bool_), np.empty(shape, np.bool_)
+        out = _Placed(*places, *flags, np.empty((*shape, 2)), np.empty(shape), np.empty((count, 3, 3)))
         if self._correct_centres is None:
-            self._correct_centres = bound(correct_centres, *arguments)
-        self._correct_centres(*arguments)
+            self._correct_centres = bound(correct_centres, self._rig, directions, observed, out)
+        self._correct_centres(self._rig, directions, observed, out)
         return RayPositions(*out)
 
     def triangulate(self, uv: Float, sigma_px: float | Float = 0.1) -> Triangulation:
         """Triangulate markers as they are seen (`master.fabrik.intersection`)."""
-        return triangulate(self._cameras, uv, sigma_px, self._rays_px)
+        return triangulate(self._rig.cameras, uv, sigma_px, self._rig.rays_px)

@@ -33,7 +33,7 @@ from master.fabrik.closed_form import (
     targets_of,
 )
 from master.fabrik.fabrik import Chain, Coupling, Link, solve_chain
-from master.fabrik.joints import ChainArrays, Hinge, Pair, Rotor, end_of
+from master.fabrik.joints import ChainArrays, Hinge, Rotor, end_of
 from master.fabrik.linear_algebra import IDENTITY, Vector, as_matrix, as_vector, length, minus
 from master.fabrik.one_euro import PointFilter
 from master.fabrik.rays import RayTriangulator
@@ -72,46 +72,68 @@ NOT_SEEN = FingerSolution(_NAN, _NAN, _NAN, _NAN, _NAN, False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FingerSolver:
-    """Closed form of one finger of one hand, prepared; build once with `of`."""
+class Finger:
+    """One finger of one hand, prepared, without state; build it with `of`."""
 
-    chain: Chain  # the finger's links and limits, root frame (the palm's axes, origin at the root joint)
+    chain: Chain  # its links and limits, root frame (the palm's axes, origin at the root joint)
     root: Vector  # MCP (thumb: CMC) in the palm frame [m]
-    ratio: float  # DIP per PIP that makes the closed form exact
+    ratio: float  # DIP (thumb: IP) per PIP (MCP) that makes the closed form exact
     edges: Float  # (B + 1,) ends of the branches of the PIP, rising [rad]
-    start: Callable[..., float]  # `start_of`, bound to the types of this finger
+    tolerance_m: float  # of FABRIK: residual that counts as reached
+    max_iterations: int  # the seed is the answer, and what it cannot reach iterations improve little
+    start: Callable[..., float]  # `start_of`, and `bring_onto`, bound to the types of this finger
+    bring: Callable[..., tuple[float, int]]
 
     @classmethod
     def of(
-        cls, model: HandModel, finger: int, offset_m: Float, free_ratio: float | None = None
-    ) -> "FingerSolver":
+        cls,
+        model: HandModel,
+        finger: int,
+        offset_m: Float,
+        tolerance_m: float = 1e-5,
+        max_iterations: int = 10,
+    ) -> "Finger":
         """Prepare one finger, 0 thumb ... 4 little.
 
-        Args:
-            offset_m: The observed point (3,) in the tip joint's frame [m]; zero: the tip joint.
-            free_ratio: DIP (thumb: IP) per PIP (MCP) to prefer where the model leaves it free; None: the
-                ratio it tends to, else that of their highest angles, with which every distance is reached.
+        The ratio is the model's; where it leaves it free, that of the highest angles, with which every
+        distance is reached. `offset_m`: the observed point (3,) in the tip joint's frame [m]; zero: the joint.
+
+        Raises:
+            ValueError: Tolerance or iterations are not positive.
         """
-        chain = finger_chain(model, finger, offset_m)
-        (_, pip_high), (_, dip_high) = chain.spans[2:]
+        if not tolerance_m > 0.0 or max_iterations < 1:
+            raise ValueError(
+                f"tolerance {tolerance_m} m and {max_iterations} iterations: both must be positive"
+            )
+        chain, root = finger_chain(model, finger, offset_m), finger_root(model, finger)
+        (_, pip_high), (_, dip_high) = chain.spans[2:].tolist()
+        ratio = dip_high / pip_high if pip_high > 0.0 else 1.0
         if chain.coupling is not None:
             ratio = chain.coupling.ratio
-        elif free_ratio is not None:
-            ratio = free_ratio
         elif finger != THUMB and model.dip_per_pip is not None:
             ratio = model.dip_per_pip
-        else:
-            ratio = dip_high / pip_high if pip_high > 0.0 else 1.0
-        edges, four, goal = _branches(chain, float(ratio)), np.zeros(4), (0.0, 0.0, 0.0)
-        start = bound(start_of, chain.arrays, edges, float(ratio), goal, four, four)
-        return cls(chain, finger_root(model, finger), float(ratio), edges, start)
+        ratio, tolerance_m = float(ratio), float(tolerance_m)
+        edges, angles = _branches(chain, ratio), np.zeros(4)
+        prepared = chain.arrays, edges, ratio
+        start = bound(start_of, *prepared, (0.0, 0.0, 0.0), angles, angles)
+        bring = bound(bring_onto, *prepared, root, np.zeros(3), tolerance_m, max_iterations, angles)
+        return cls(chain, root, ratio, edges, tolerance_m, max_iterations, start, bring)
 
-    @property
-    def limits(self) -> tuple[Pair, ...]:
-        """Low and high of the four angles [rad]; as of `Chain.spans`."""
-        return self.chain.spans
+    def solve(self, target_m: Float, angles_rad: Float) -> FingerResult:
+        """Bring the finger's point to a target: FABRIK from the closed form.
 
-    def solve(self, target: Vector, warm_start: Four | None = None) -> FingerSolution:
+        Where the DIP is free (always the thumb's) the point does not fix all angles, and FABRIK starts from
+        the given ones; from the closed form only where they are NaN or do not lead to the target. `target_m`
+        (3,), palm frame; NaN: not seen. `angles_rad` (4,) in place, contiguous; in: those of a moment ago,
+        NaN: not known; out: the best legal ones, or as given where the target is not finite.
+        """
+        prepared = self.chain.arrays, self.edges, self.ratio, self.root
+        residual, iterations = self.bring(
+            *prepared, target_m, self.tolerance_m, self.max_iterations, angles_rad
+        )
+        return FingerResult(residual, iterations, residual <= self.tolerance_m)
+
+    def closed_form(self, target: Vector, warm_start: Four | None = None) -> FingerSolution:
         """Angles that bring the point to `target`, or as near to it as the limits allow.
 
         `target`: (x, y, z) in the palm frame [m]; NaN: not seen, so are the angles. `warm_start`: angles of a
@@ -130,55 +152,6 @@ class FingerSolver:
         """The point [m] in the palm frame at given angles [rad]."""
         x, y, z = end_of(self.chain.arrays, np.array(angles, np.float64))
         return x + self.root[0], y + self.root[1], z + self.root[2]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Finger:
-    """FABRIK for one finger of one hand, prepared. Holds no state between calls."""
-
-    closed_form: FingerSolver
-    tolerance_m: float  # residual that counts as reached
-    max_iterations: int  # the seed is the answer, and what it cannot reach iterations improve little
-    bring: Callable[..., tuple[float, int]]  # `bring_onto`, bound to the types of this finger
-
-    @classmethod
-    def of(
-        cls,
-        model: HandModel,
-        finger: int,
-        offset_m: Float,
-        tolerance_m: float = 1e-5,
-        max_iterations: int = 10,
-    ) -> "Finger":
-        """Prepare one finger; arguments as of `FingerSolver.of`.
-
-        Raises:
-            ValueError: Tolerance or iterations are not positive.
-        """
-        if not tolerance_m > 0.0 or max_iterations < 1:
-            raise ValueError(
-                f"tolerance {tolerance_m} m and {max_iterations} iterations: both must be positive"
-            )
-        solver = FingerSolver.of(model, finger, offset_m)
-        chain, root, tolerance_m = solver.chain.arrays, solver.root, float(tolerance_m)
-        target, angles = np.zeros(3), np.zeros(4)
-        bring = bound(
-            bring_onto, chain, solver.edges, solver.ratio, root, target, tolerance_m, max_iterations, angles
-        )
-        return cls(solver, tolerance_m, max_iterations, bring)
-
-    def solve(self, target_m: Float, angles_rad: Float) -> FingerResult:
-        """Bring the finger's point to a target: FABRIK from the closed form.
-
-        Where the DIP is free (always the thumb's) the point does not fix all angles, and FABRIK starts from
-        the given ones; from the closed form only where they are NaN or do not lead to the target. `target_m`
-        (3,), palm frame; NaN: not seen. `angles_rad` (4,) in place, contiguous; in: those of a moment ago,
-        NaN: not known; out: the best legal ones, or as given where the target is not finite.
-        """
-        solver, tolerance_m, most = self.closed_form, self.tolerance_m, self.max_iterations
-        prepared = solver.chain.arrays, solver.edges, solver.ratio, solver.root
-        residual, iterations = self.bring(*prepared, target_m, tolerance_m, most, angles_rad)
-        return FingerResult(residual, iterations, residual <= tolerance_m)
 
 
 @kernel
@@ -259,8 +232,10 @@ def _branches(chain: Chain, ratio: float) -> Float:
     def distance2(pip: float) -> float:
         return distance2_of(chain.arrays, ratio, pip)[0]
 
-    (low, high), dip_span = chain.spans[2:]
-    grid, squares = np.linspace(low, high, _GRID), np.empty(_GRID)
+    low, high = map(float, chain.spans[2])
+    dip_span = [float(bound) for bound in chain.spans[3]]
+    grid: Float = np.linspace(low, high, _GRID)
+    squares = np.empty(_GRID)
     distances2(chain.arrays, ratio, grid, squares)
     rising = np.diff(squares) > 0.0
     cuts = {low, high}

@@ -101,12 +101,9 @@ def propagate(
         alternatives.
     """
     used, track = np.empty(SETTINGS.observations, np.int64), np.empty((SETTINGS.observations, 2, 4))
-    known, L, z = (
-        np.empty((SETTINGS.observations, 5)),
-        np.empty((SETTINGS.observations, SETTINGS.observations)),
-        np.empty((SETTINGS.observations, 4)),
-    )
-    fit, mixed = np.empty(6 + SETTINGS.observations), np.empty(6 + SETTINGS.observations)
+    most = SETTINGS.observations
+    known, L, z = np.empty((most, 5)), np.empty((most, most)), np.empty((most, 4))
+    fit, mixed = np.empty(6 + most), np.empty(6 + most)
     ready_ns, alternatives = SETTINGS.never, False
     for c in range(len(history.total)):
         n = _around(history, c, t_ns, reach_ns, used)

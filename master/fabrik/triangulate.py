@@ -203,6 +203,23 @@ def _across(ahead: Float, tilt: Float, out: Float) -> None:
 
 
 @kernel
+def _place(
+    tables: DisparityTables, uv: Float, m: int, bias: Float, ray: Float, point: Float
+) -> tuple[float, float]:
+    """Place centroids of marker m less `bias` (2, 2) [px], as `place_centroids`."""
+    u, v = uv[0, m, 0] - bias[0, 0], uv[0, m, 1] - bias[0, 1]
+    return place_centroids(tables, u, v, uv[1, m, 0] - bias[1, 0], uv[1, m, 1] - bias[1, 1], ray, point)
+
+
+@inner
+def _forget(m: int, points: Float, cov: Float, noise: Float) -> None:
+    """Write that marker m is not placed."""
+    points[m, :] = np.nan
+    cov[m, :, :] = np.nan
+    noise[m, :, :] = np.nan
+
+
+@kernel
 def triangulate(
     tables: DisparityTables,
     caps: CapTables,
@@ -231,31 +248,21 @@ def triangulate(
     whole, variance, by = np.empty((1, 2)), np.empty(2), np.empty((3, 3))
     seen_px2, scale_m = np.empty(2), np.empty(2)
     for m in range(uv.shape[1]):
-        points[m, :] = np.nan
-        cov[m, :, :] = np.nan
-        noise[m, :, :] = np.nan
+        _forget(m, points, cov, noise)
         outliers[m] = False
         if not np.isfinite(uv[0, m, 0] + uv[0, m, 1] + uv[1, m, 0] + uv[1, m, 1]):
             continue
-        whole[0, 0] = whole[0, 1] = 0.0
+        whole[:], bias[:] = 0.0, 0.0
         row = caps.row[m]
         known = row >= 0 and np.isfinite(ahead[m, 0])
-        z, rows = place_centroids(tables, uv[0, m, 0], uv[0, m, 1], uv[1, m, 0], uv[1, m, 1], ray, point)
+        z, rows = _place(tables, uv, m, bias, ray, point)
         if not np.isfinite(z):
             continue
         if known:
             cap_bias(tables, caps, row, ahead[m], point, bias, whole[0])
             for k in range(3):
                 aim[k] = point[k]
-            z, rows = place_centroids(
-                tables,
-                uv[0, m, 0] - bias[0, 0],
-                uv[0, m, 1] - bias[0, 1],
-                uv[1, m, 0] - bias[1, 0],
-                uv[1, m, 1] - bias[1, 1],
-                ray,
-                point,
-            )
+            z, rows = _place(tables, uv, m, bias, ray, point)
             if not np.isfinite(z):  # so near that what is seen of the cap is no disparity
                 continue
             for k in range(3):
@@ -276,15 +283,7 @@ def triangulate(
                 for c in range(2):
                     whole[0, c] = max(whole[0, c], shown[c])
                 off[:] = np.nan
-                place_centroids(
-                    tables,
-                    uv[0, m, 0] - bias[0, 0],
-                    uv[0, m, 1] - bias[0, 1],
-                    uv[1, m, 0] - bias[1, 0],
-                    uv[1, m, 1] - bias[1, 1],
-                    by[2],
-                    off,
-                )
+                _place(tables, uv, m, bias, by[2], off)
                 for a in range(3):
                     for b in range(3):
                         cov[m, a, b] += (off[a] - points[m, a]) * (off[b] - points[m, b])
@@ -300,8 +299,7 @@ def triangulate(
         hidden_part(caps, row, seen_px2, scale_m, whole, _ONE, variance)
         rows2 = tables.row_sigma_px * tables.row_sigma_px + sigma_px[0, m] ** 2 + sigma_px[1, m] ** 2
         if rows * rows > tables.row_limit * (rows2 + variance[0] + variance[1]):
-            points[m, :] = np.nan
-            cov[m, :, :] = np.nan
+            _forget(m, points, cov, noise)
             outliers[m] = True
             continue
         per_px, scale = metres_per_pixel(tables, z), z / tables.focal_px[0]
@@ -313,15 +311,12 @@ def triangulate(
         law2 = (tables.law_error * z) ** 2
         for a in range(3):
             for b in range(3):
-                noise[m, a, b] = (
-                    left2 * (by[a, 0] * by[b, 0] + by[a, 1] * by[b, 1]) + right2 * by[a, 2] * by[b, 2]
-                )
+                left = left2 * (by[a, 0] * by[b, 0] + by[a, 1] * by[b, 1])
+                noise[m, a, b] = left + right2 * by[a, 2] * by[b, 2]
                 cov[m, a, b] += noise[m, a, b] + law2 * ray[a] * ray[b]
         # A point is placed with its covariance, and where its depth is determined (`master.fabrik.rays`).
         if not 4.0 * (cov[m, 0, 0] + cov[m, 1, 1] + cov[m, 2, 2]) < z * z or not np.isfinite(cov[m].sum()):
-            points[m, :] = np.nan
-            cov[m, :, :] = np.nan
-            noise[m, :, :] = np.nan
+            _forget(m, points, cov, noise)
 
 
 class DepthTriangulator:

@@ -25,59 +25,42 @@ its bones may be anywhere, as those of a palm that one pair of cameras looks int
 """
 
 from dataclasses import dataclass
-from math import erf, isfinite, nan, sqrt
-from typing import NamedTuple
+from math import erf, isfinite, sqrt
+from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 
 from common.arrays import Float
 from common.calibration.gesture_settings import PinchSettings, PointSettings, TapSettings
 from common.hand.model import CHAINS, FINGERS, TIPS
-from common.kernels import kernel
-from common.messages import Gesture, GestureKind, Phase
-from master.fabrik.linear_algebra import spread
-from master.gestures.features import HandFeatures, ThumbTouch
+from common.kernels import constant, kernel
+from common.messages import Gesture, Phase
+from master.fabrik.linear_algebra import length, minus, spread
+from master.gestures.features import HandFeatures, ThumbTouch, point_at
 
 _NOWHERE = np.full(3, np.nan)
-_NOWHERE.flags.writeable = False
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HeldGesture:
-    """A gesture that has begun; hand, kind and name as of `Gesture`, its begin [ns]."""
+class ActionMonitor:
+    """Base of the detectors of actions; holds the last message of a gesture."""
 
-    hand: str
-    kind: GestureKind
-    name: str
-    began_t_ns: int
+    def __init__(self) -> None:
+        self._last: Gesture | None = None
 
-    def message(
-        self,
-        phase: Phase,
-        t_ns: int,
-        confidence: float,
-        *,
-        distance_m: float = nan,
-        strength: float = nan,
-        angle_rad: float = nan,
-        origin_m: Float = _NOWHERE,
-        direction: Float = _NOWHERE,
-    ) -> Gesture:
-        """Return the message of an epoch."""
-        return Gesture(
-            hand=self.hand,
-            t_ns=t_ns,
-            kind=self.kind,
-            name=self.name,
-            phase=phase,
-            began_t_ns=self.began_t_ns,
-            confidence=min(max(confidence, 0.0), 1.0),
-            distance_m=distance_m,
-            strength=strength,
-            angle_rad=angle_rad,
-            origin_m=origin_m,
-            direction=direction,
-        )
+    @property
+    def active(self) -> bool:
+        """Whether one has begun."""
+        return self._last is not None
+
+    def _send(
+        self, of: Gesture, phase: Phase, t_ns: int, confidence: float, **quantities: Any
+    ) -> list[Gesture]:
+        """Return the message of an epoch about a gesture; hold it until the end."""
+        confidence = min(max(confidence, 0.0), 1.0)
+        message = replace(of, phase=phase, t_ns=t_ns, confidence=confidence, **quantities)
+        self._last = None if phase == "end" else message
+        return [message]
 
 
 def below(value: float, limit: float, sigma: float) -> float:
@@ -87,50 +70,50 @@ def below(value: float, limit: float, sigma: float) -> float:
     return 0.5 * (1.0 + erf((limit - value) / (max(sigma, 1e-6) * sqrt(2.0))))
 
 
-class PinchMonitor:
-    """Detector of pinches; holds the begun one, its last known gap and time."""
+class PinchMonitor(ActionMonitor):
+    """Detector of pinches; holds the last known gap and time of the begun one."""
 
     def __init__(self, settings: PinchSettings) -> None:
+        super().__init__()
         self._settings = settings
-        self._pinch: HeldGesture | None = None
         self._finger, self._known_ns, self._gap_m = 0, 0, 0.0
-        self._last: Gesture | None = None
-
-    @property
-    def active(self) -> bool:
-        """Whether one has begun."""
-        return self._pinch is not None
 
     def push(self, seen: HandFeatures, touch: ThumbTouch, *, may_begin: bool) -> list[Gesture]:
         """Return the messages at an epoch; a pinch begins only where it may."""
-        if self._pinch is None:
+        pinch, t_ns = self._last, seen.t_ns
+        phase: Phase = "update"
+        if pinch is None:
             finger = self._begins(seen, touch) if may_begin else None
             if finger is None:
                 return []
-            self._finger, self._known_ns = finger, seen.t_ns
-            self._gap_m = float(touch.gap_m[finger])
-            self._pinch = HeldGesture(seen.hand, "pinch", FINGERS[finger + 1], seen.t_ns)
-            return [self._message(self._pinch, "begin", seen, touch)]
-        if self._known(touch, self._finger):
-            self._known_ns, self._gap_m = seen.t_ns, float(touch.gap_m[self._finger])
-            if self._gap_m > self._settings.end_gap_m:
-                return self._end(self._message(self._pinch, "end", seen, touch))
-        elif (seen.t_ns - self._known_ns) * 1e-9 > self._settings.lost_s:
-            return self._end(self._message(self._pinch, "end", seen, touch))
-        return [self._message(self._pinch, "update", seen, touch)]
+            self._finger, phase = finger, "begin"
+            pinch = Gesture(seen.hand, t_ns, "pinch", FINGERS[finger + 1], phase, t_ns, 1.0)
+        if phase == "begin" or self._known(touch, self._finger):
+            self._known_ns, self._gap_m = t_ns, float(touch.gap_m[self._finger])
+            if phase == "update" and self._gap_m > self._settings.end_gap_m:
+                phase = "end"
+        elif self._lost(t_ns):
+            phase = "end"
+        own, gap = self._settings, self._gap_m
+        strength = (own.open_gap_m - gap) / (own.open_gap_m - own.closed_gap_m)
+        return self._send(
+            pinch,
+            phase,
+            t_ns,
+            below(gap, own.end_gap_m, float(touch.key_sigma_m[self._finger, 2])),
+            distance_m=gap,
+            strength=min(max(strength, 0.0), 1.0),
+            origin_m=touch.middle_m[self._finger],
+        )
 
     def lost(self, t_ns: int) -> list[Gesture]:
         """Return the messages at an epoch at which there is no hand."""
-        last = self._last
-        if self._pinch is None or last is None or (t_ns - self._known_ns) * 1e-9 <= self._settings.lost_s:
+        if self._last is None or not self._lost(t_ns):
             return []
-        return self._end(
-            self._pinch.message("end", t_ns, 0.0, distance_m=last.distance_m, strength=last.strength)
-        )
+        return self._send(self._last, "end", t_ns, 0.0, origin_m=_NOWHERE)
 
-    def _end(self, message: Gesture) -> list[Gesture]:
-        self._pinch = self._last = None
-        return [message]
+    def _lost(self, t_ns: int) -> bool:
+        return (t_ns - self._known_ns) * 1e-9 > self._settings.lost_s
 
     def _begins(self, seen: HandFeatures, touch: ThumbTouch) -> int | None:
         own = self._settings
@@ -151,42 +134,22 @@ class PinchMonitor:
     def _known(self, touch: ThumbTouch, finger: int) -> bool:
         return bool(touch.key_sigma_m[finger, 2] <= self._settings.sigma_most_m)
 
-    def _message(self, pinch: HeldGesture, phase: Phase, seen: HandFeatures, touch: ThumbTouch) -> Gesture:
-        own, gap = self._settings, self._gap_m
-        sigma = float(touch.key_sigma_m[self._finger, 2])
-        strength = (own.open_gap_m - gap) / (own.open_gap_m - own.closed_gap_m)
-        self._last = pinch.message(
-            phase,
-            seen.t_ns,
-            below(gap, own.end_gap_m, sigma),
-            distance_m=gap,
-            strength=min(max(strength, 0.0), 1.0),
-            origin_m=touch.middle_m[self._finger],
-        )
-        return self._last
+
+_KNUCKLE, _TIP = constant(CHAINS[1, 0]), constant(CHAINS[1, 3])
 
 
-_KNUCKLE, _TIP = int(CHAINS[1, 0]), int(CHAINS[1, 3])
-
-
-class PointMonitor:
-    """Detector of pointing; holds the begun one, and since when its shape is there."""
+class PointMonitor(ActionMonitor):
+    """Detector of pointing; holds since when its shape is there."""
 
     def __init__(self, settings: PointSettings) -> None:
+        super().__init__()
         self._settings = settings
-        self._point: HeldGesture | None = None
         self._since_ns: int | None = None  # of the shape before it begins; of its loss after
         self._sure = False  # whether the ray was
-        self._last: Gesture | None = None
-
-    @property
-    def active(self) -> bool:
-        """Whether the finger points."""
-        return self._point is not None
 
     def push(self, seen: HandFeatures, *, may_begin: bool) -> list[Gesture]:
         """Return the messages at an epoch; pointing begins only where it may."""
-        own, point = self._settings, self._point
+        own, point = self._settings, self._last
         shape, before = self._shape(seen), self._sure
         held = 1.5  # the standard deviation of a ray that is reported already may be larger by this
         most_rad = own.ray_sigma_rad * (1.0 if point is None else held)
@@ -199,32 +162,27 @@ class PointMonitor:
                 self._since_ns = seen.t_ns
             if (seen.t_ns - self._since_ns) * 1e-9 < own.hold_s or not (self._sure and before):
                 return []
-            self._point, self._since_ns = HeldGesture(seen.hand, "point", "point", self._since_ns), None
-            return [self._message(self._point, "begin", seen)]
+            point = Gesture(seen.hand, seen.t_ns, "point", "point", "begin", self._since_ns, 1.0)
+            self._since_ns = None
+            return self._ray(point, "begin", seen)
         if shape and self._sure:
             self._since_ns = None
         elif self._over(seen.t_ns):
-            return self._end(self._message(point, "end", seen))
-        return [self._message(point, "update", seen)]
+            return self._ray(point, "end", seen)
+        return self._ray(point, "update", seen)
 
     def lost(self, t_ns: int) -> list[Gesture]:
         """Return the messages at an epoch at which there is no hand."""
-        last = self._last
-        if self._point is None or last is None or not self._over(t_ns):
+        if self._last is None or not self._over(t_ns):
             return []
-        return self._end(
-            self._point.message("end", t_ns, 0.0, origin_m=last.origin_m, direction=last.direction)
-        )
+        self._since_ns = None
+        return self._send(self._last, "end", t_ns, 0.0)
 
     def _over(self, t_ns: int) -> bool:
         """Whether the shape has been lost for long, counted from the first call."""
         if self._since_ns is None:
             self._since_ns = t_ns
         return (t_ns - self._since_ns) * 1e-9 >= self._settings.hold_s
-
-    def _end(self, message: Gesture) -> list[Gesture]:
-        self._point, self._since_ns, self._last = None, None, None
-        return [message]
 
     def _shape(self, seen: HandFeatures) -> bool:
         """Whether the index finger is extended and the others flexed, as far as known."""
@@ -241,18 +199,17 @@ class PointMonitor:
         )
         return bent and (index <= own.stretched_rad + slack or not known[1])
 
-    def _message(self, point: HeldGesture, phase: Phase, seen: HandFeatures) -> Gesture:
+    def _ray(self, point: Gesture, phase: Phase, seen: HandFeatures) -> list[Gesture]:
+        """Return the message with the ray of an epoch, as it was where it is not sure."""
         tip = seen.joints_m[_TIP]
-        way = tip - seen.joints_m[_KNUCKLE]
-        if not self._sure and self._last is not None:
-            way = self._last.direction
+        way = tip - seen.joints_m[_KNUCKLE] if self._sure else point.direction
+        if phase == "end":
+            self._since_ns = None
         middle = 0.5 * (self._settings.stretched_rad + self._settings.bent_rad)
         clear = [min(max((bend - middle) / middle, 0.0), 1.0) for bend in _bends(seen)[2:]]
         known = 1.0 if seen.sigma_m[1] <= self._settings.sigma_most_m else 0.5
-        self._last = point.message(
-            phase, seen.t_ns, known * sum(clear) / len(clear), origin_m=tip, direction=way / sqrt(way @ way)
-        )
-        return self._last
+        confidence = known * sum(clear) / len(clear)
+        return self._send(point, phase, seen.t_ns, confidence, origin_m=tip, direction=way / sqrt(way @ way))
 
 
 def _bends(seen: HandFeatures) -> list[float]:
@@ -267,13 +224,9 @@ def _ray_sigma_rad(joints: Float, cov: Float) -> float:
 
     What is across the ray of both ends' covariance counts: P C P with P = I - w w'.
     """
-    x, y, z = (
-        joints[_TIP, 0] - joints[_KNUCKLE, 0],
-        joints[_TIP, 1] - joints[_KNUCKLE, 1],
-        joints[_TIP, 2] - joints[_KNUCKLE, 2],
-    )
-    length = sqrt(x * x + y * y + z * z)
-    w = x / length, y / length, z / length
+    way = minus(point_at(joints, _TIP), point_at(joints, _KNUCKLE))
+    far = length(way)
+    w = way[0] / far, way[1] / far, way[2] / far
     both, along, total = np.empty((3, 3)), np.zeros(3), 0.0
     for i in range(3):
         for k in range(3):
@@ -283,7 +236,7 @@ def _ray_sigma_rad(joints: Float, cov: Float) -> float:
     for i in range(3):
         for k in range(3):
             both[i, k] += w[i] * w[k] * total - w[i] * along[k] - along[i] * w[k]
-    return spread(both)[1] / length
+    return spread(both)[1] / far
 
 
 # Name of the key on each segment, from the knuckle on, of index ... little.
@@ -335,7 +288,10 @@ class ThumbTapMonitor:
         segment = keys[finger].index(gap)
         sigma = float(touch.key_sigma_m[finger, segment])
         # Of the finger its PIP must be known, too, along its worst axis.
-        known = sigma <= own.sigma_most_m and _worst_m(seen, CHAINS[finger + 1, 1]) <= own.place_sigma_m
+        known = (
+            sigma <= own.sigma_most_m
+            and spread(seen.joints_cov_m2[CHAINS[finger + 1, 1]])[1] <= own.place_sigma_m
+        )
         now = _Epoch(gaps, sigma, float(seen.sigma_m[0]), seen.joints_m)
         if self._touch is not None:
             return self._go_on(self._touch, seen, now, known=known)
@@ -345,7 +301,10 @@ class ThumbTapMonitor:
             self._clear_ns, self._clear_rad = seen.t_ns, _bend_rad(seen)
         # cosine: a thumb that lies on the back of a segment touches no key
         palmar = bool(touch.key_palmar[finger, segment] > (-0.3))
-        if gap <= own.touch_gap_m and may_begin and palmar and self._begins(seen):
+        apart = (seen.t_ns - self._tapped_ns) * 1e-9 >= own.apart_s
+        approached = (seen.t_ns - self._clear_ns) * 1e-9 <= own.approach_s
+        near = gap <= own.touch_gap_m and may_begin and palmar
+        if near and apart and approached and is_pad(seen, own):
             self._touch = _Touch(seen.t_ns, self._clear_rad, gap, [now])
         return []
 
@@ -372,11 +331,6 @@ class ThumbTapMonitor:
             return []
         return self._tapped(going, seen)
 
-    def _begins(self, seen: HandFeatures) -> bool:
-        own = self._settings
-        apart = (seen.t_ns - self._tapped_ns) * 1e-9 >= own.apart_s
-        return apart and (seen.t_ns - self._clear_ns) * 1e-9 <= own.approach_s and is_pad(seen, own)
-
     def _tapped(self, gone: _Touch, seen: HandFeatures) -> list[Gesture]:
         """The tap of a touch that is over; none where two fingers may have been touched."""
         least = [min(one.gap_m) for one in gone.epochs]
@@ -396,10 +350,15 @@ class ThumbTapMonitor:
         sure = below(gone.least_m, self._settings.leave_gap_m, sigma) * below(0.0, nearer_m, sigma)
         sure *= below(0.0, float(np.abs(beyond).min()), sigma)
         self._tapped_ns = seen.t_ns
-        tap = HeldGesture(seen.hand, "tap", KEYS[finger][segment], gone.began_ns)
         ends = CHAINS[finger + 1, segment : segment + 2]
         middle = 0.5 * (nearest.joints_m[ends].mean(axis=0) + nearest.joints_m[TIPS[0]])
-        return [tap.message("end", seen.t_ns, sure, distance_m=gone.least_m, origin_m=middle)]
+        key = KEYS[finger][segment]
+        sure = min(max(sure, 0.0), 1.0)
+        return [
+            Gesture(
+                seen.hand, seen.t_ns, "tap", key, "end", gone.began_ns, sure, gone.least_m, origin_m=middle
+            )
+        ]
 
 
 def is_pad(seen: HandFeatures, settings: TapSettings) -> bool:
@@ -417,11 +376,6 @@ def _finger_bends(seen: HandFeatures) -> list[float]:
 def _bend_rad(seen: HandFeatures) -> float:
     """How far the four fingers are bent together [rad]."""
     return sum(_finger_bends(seen)) / 4.0
-
-
-def _worst_m(seen: HandFeatures, joint: int) -> float:
-    """Standard deviation [m] of a joint along its worst axis."""
-    return spread(seen.joints_cov_m2[joint])[1]
 
 
 def _beyond_m(joints_m: Float, finger: int) -> Float:

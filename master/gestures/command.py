@@ -2,12 +2,12 @@
 
 from argparse import Namespace
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
+from common.bus.bus import ANY
 from common.calibration import HandProfile, load, save
 from common.calibration.gesture_settings import GestureSettings, default_gestures
 from common.clock import SystemClock
@@ -18,72 +18,40 @@ from common.messages import Gesture, HandPose
 from master.calibrate.tree_files import provenance
 from master.gestures.poses import GestureRecogniser
 from master.gestures.templates import Example, PoseTemplate, held, learn, template_session, what_lacks
-from master.outputs.poses import Poses, load_poses
+from master.outputs.poses import Poses
 from master.run.process import join_bus
 
 
-@dataclass(frozen=True, slots=True)
-class Spoken:
-    """One gesture from its begin to its end.
+def spans_of(gestures: Iterable[Gesture], since_ns: int) -> list[str]:
+    """Return a line for each gesture, in order of their begins, since an epoch [ns].
 
-    Attributes:
-        kind, name: As of the messages.
-        began_t_ns, ended_t_ns: [ns]; where the poses end before it, its last message.
-        confidence: The highest.
-        value: What it reported last: a distance, a strength, an angle; empty for a pose.
+    From when to when (where the poses end before it, its last message), which one, its highest confidence, and what
+    it reported last: a distance, an angle; nothing for a pose.
     """
-
-    kind: str
-    name: str
-    began_t_ns: int
-    ended_t_ns: int
-    confidence: float
-    value: str
-
-    def line(self, since_ns: int) -> str:
-        """Return a readable line; times are since an epoch [ns]."""
-        began, ended = (1e-9 * (t_ns - since_ns) for t_ns in (self.began_t_ns, self.ended_t_ns))
-        who = self.kind if self.name == self.kind else f"{self.kind} {self.name}"
-        return f"{began:9.3f} s to {ended:9.3f} s  {who:24s} {self.confidence:.2f}  {self.value}".rstrip()
-
-
-def read_gestures(poses: Poses, settings: GestureSettings, model: HandModel) -> list[Gesture]:
-    """Return all gestures of a hand in its poses."""
-    recogniser = GestureRecogniser(settings, model)
-    return [gesture for k in range(len(poses)) for gesture in recogniser.push(poses.pose(k))]
-
-
-def spans_of(gestures: Iterable[Gesture]) -> list[Spoken]:
-    """Each gesture once, in the order of their begins."""
-    last: dict[tuple[str, str, int], Gesture] = {}
-    most: dict[tuple[str, str, int], float] = {}
+    last: dict[tuple[int, str, str], Gesture] = {}
+    most: dict[tuple[int, str, str], float] = {}
     for one in gestures:
-        key = (one.kind, one.name, one.began_t_ns)
+        key = (one.began_t_ns, one.kind, one.name)
         most[key] = max(most.get(key, 0.0), one.confidence)
         last[key] = one
-    spans = [
-        Spoken(kind, name, began, one.t_ns, most[kind, name, began], _value(one))
-        for (kind, name, began), one in last.items()
-    ]
-    return sorted(spans, key=lambda span: span.began_t_ns)
+    lines: list[str] = []
+    for key, one in sorted(last.items(), key=lambda item: item[0][0]):
+        began, ended = (1e-9 * (t_ns - since_ns) for t_ns in (one.began_t_ns, one.t_ns))
+        who = one.kind if one.name == one.kind else f"{one.kind} {one.name}"
+        values = [f"{1e3 * one.distance_m:.1f} mm"] if np.isfinite(one.distance_m) else []
+        values += [f"{np.degrees(one.angle_rad):.1f} deg"] if np.isfinite(one.angle_rad) else []
+        text = f"{began:9.3f} s to {ended:9.3f} s  {who:24s} {most[key]:.2f}  {', '.join(values)}"
+        lines.append(text.rstrip())
+    return lines
 
 
 def lines_of(gesture: Gesture) -> str:
     """Return a message as a line of JSON: arrays are lists, missing values null."""
-    fields = {name: getattr(gesture, name) for name in gesture.__struct_fields__}
     plain = {
-        name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in fields.items()
+        name: value.tolist() if isinstance(value, np.ndarray) else value
+        for name, value in msgspec.structs.asdict(gesture).items()
     }
     return msgspec.json.encode(plain).decode()
-
-
-def _value(gesture: Gesture) -> str:
-    parts: list[str] = []
-    if np.isfinite(gesture.distance_m):
-        parts.append(f"{1e3 * gesture.distance_m:.1f} mm")
-    if np.isfinite(gesture.angle_rad):
-        parts.append(f"{np.degrees(gesture.angle_rad):.1f} deg")
-    return ", ".join(parts)
 
 
 _TOOL = "gestures teach"
@@ -136,14 +104,14 @@ def _read(options: Namespace) -> None:
     """Notify which gestures a recorded hand makes, from when to when."""
     path = _settings_path(options)
     known = load(path, GestureSettings) if options.settings is not None else _settings(path)
-    rows = load_poses(options.poses)
-    stated = read_gestures(rows, known, _model(options.hand, rows.hand, options.calibration))
+    rows = Poses.load(options.poses)
+    recogniser = GestureRecogniser(known, _model(options.hand, rows.hand, options.calibration))
+    stated = [gesture for pose in rows.messages() for gesture in recogniser.push(pose)]
     if options.every:
         for gesture in stated:
             echo(lines_of(gesture))
-    begin_ns = int(rows.t_ns[0]) if len(rows) else 0
-    for span in spans_of(stated):
-        echo(span.line(begin_ns))
+    for line in spans_of(stated, int(rows.t_ns[0]) if len(rows) else 0):
+        echo(line)
 
 
 def _list(known: GestureSettings) -> None:
@@ -179,13 +147,13 @@ def with_pose(settings: GestureSettings, name: str, templates: PoseTemplate, sou
 
 def _recorded(options: Namespace) -> list[Example]:
     """Examples of a recorded run."""
-    rows = load_poses(options.poses)
+    rows = Poses.load(options.poses)
     model = _model(options.hand, rows.hand, options.calibration)
     out: list[Example] = []
     for text in options.ranges:
         low, high = seconds_of(text)
         t_s = 1e-9 * (rows.t_ns - rows.t_ns[0])
-        chosen = [rows.pose(k) for k in ((t_s >= low) & (t_s <= high)).nonzero()[0].tolist()]
+        chosen = rows.where((t_s >= low) & (t_s <= high)).messages()
         frames = held(chosen, model)
         if lacking := what_lacks(frames):
             raise FitError(f"--range {text}: {lacking if frames else 'no hand in it'}")
@@ -213,11 +181,7 @@ def _live(options: Namespace) -> list[Example]:
     link = join_bus(options.bus)
     try:
         depth = 256  # poses that may wait while a line is printed
-        queue = (
-            link.subscribe("hand", depth=depth)
-            if options.hand_name is None
-            else link.subscribe("hand", options.hand_name, depth)
-        )
+        queue = link.subscribe("hand", options.hand_name or ANY, depth)
         first_s = 10.0  # until the first pose of a running master must have come
         first = queue.get(first_s)
         if not isinstance(first, HandPose):

@@ -25,7 +25,7 @@ from statistics import median
 from common.arrays import Float
 from common.calibration.gesture_settings import DialSettings
 from common.messages import Gesture, Phase
-from master.gestures.actions import HeldGesture
+from master.gestures.actions import ActionMonitor
 from master.gestures.features import HandFeatures
 from master.gestures.grip import Tips, axis_of, is_grip, may_grip, rotation_between, spread_m, widened_m
 
@@ -118,23 +118,20 @@ class _Grip:
     axis: Float
 
 
-class DialMonitor:
-    """Detector of dial gestures; holds the dial, its grip, its angle, a grip to be."""
+class DialMonitor(ActionMonitor):
+    """Detector of dial gestures; holds the dial's grip, its angle, a grip to be.
+
+    A dial has begun while it is gripped, or about to be gripped again.
+    """
 
     def __init__(self, settings: DialSettings) -> None:
+        super().__init__()
         self._settings = settings
-        self._dial: HeldGesture | None = None
         self._grip: _Grip | None = None
         self._maybe: deque[tuple[int, Tips, bool]] = deque()  # since when tips are as they are now; a grip's?
         self._angle = 0.0
         self._before: Tips | None = None  # those of the grip that was let go
         self._closed_ns = self._known_ns = 0  # when the dial was gripped, and tips were known, last
-        self._last: Gesture | None = None
-
-    @property
-    def active(self) -> bool:
-        """Whether a dial has begun, gripped or about to be gripped again."""
-        return self._dial is not None
 
     def push(
         self, seen: HandFeatures, across_m: float, *, may_begin: bool, wrist_device_only: bool = False
@@ -146,45 +143,37 @@ class DialMonitor:
             may_begin: Whether a dial may begin.
             wrist_device_only: All that sees the hand is worn on its arm: the rig frame goes with it.
         """
-        if self._dial is None and not may_begin:
+        own, dial = self._settings, self._last
+        if dial is None and not may_begin:
             self._maybe.clear()
             return []
-        grips = self._dial is None and may_grip(seen, across_m, self._settings)
-        if self._dial is None and not grips and not self._maybe:
+        grips = dial is None and may_grip(seen, across_m, own)
+        if dial is None and not grips and not self._maybe:
             return []
-        tips = Tips.of(seen, self._settings.sigma_most_m, wrist_device_only=wrist_device_only)
-        if self._dial is None:
-            grips = grips and is_grip(seen, tips, self._settings)
-            axis = self._held(seen.t_ns, tips, self._settings.hold_s, grips=grips)
+        tips = Tips.of(seen, own.sigma_most_m, wrist_device_only=wrist_device_only)
+        if dial is None:
+            grips = grips and is_grip(seen, tips, own)
+            axis = self._held(seen.t_ns, tips, own.hold_s, grips=grips)
             if axis is None:
                 return []
-            self._dial = HeldGesture(seen.hand, "dial", "dial", seen.t_ns)
             self._angle = 0.0
             self._take(tips, axis)
             self._closed_ns = self._known_ns = seen.t_ns
-            return [self._message(self._dial, "begin", seen, tips)]
+            dial = Gesture(seen.hand, seen.t_ns, "dial", "dial", "begin", seen.t_ns, 1.0)
+            return self._turned(dial, "begin", seen, tips)
         self._follow(seen.t_ns, tips)
-        own = self._settings
         opened = self._grip is None and (seen.t_ns - self._closed_ns) * 1e-9 > own.regrip_s
         if opened or (seen.t_ns - self._known_ns) * 1e-9 > own.lost_s:
-            return self._end(self._message(self._dial, "end", seen, tips))
-        return [self._message(self._dial, "update", seen, tips)]
+            return self._turned(dial, "end", seen, tips)
+        return self._turned(dial, "update", seen, tips)
 
     def lost(self, t_ns: int) -> list[Gesture]:
         """Return the messages at an epoch at which there is no hand."""
         self._maybe.clear()
-        last = self._last
-        if self._dial is None or last is None or (t_ns - self._known_ns) * 1e-9 <= self._settings.lost_s:
+        if self._last is None or (t_ns - self._known_ns) * 1e-9 <= self._settings.lost_s:
             return []
-        message = self._dial.message(
-            "end", t_ns, 0.0, angle_rad=self._angle, origin_m=last.origin_m, direction=last.direction
-        )
-        return self._end(message)
-
-    def _end(self, message: Gesture) -> list[Gesture]:
-        self._dial = self._grip = self._last = None
-        self._maybe.clear()
-        return [message]
+        self._grip = None
+        return self._send(self._last, "end", t_ns, 0.0, angle_rad=self._angle)
 
     def _held(self, t_ns: int, tips: Tips, hold_s: float, *, grips: bool) -> Float | None:
         """The axis of the tips, if they are still, and mostly a grip, so long."""
@@ -207,18 +196,15 @@ class DialMonitor:
         self._grip = _Grip(tips, axis, self._angle, GripHistory(self._settings.quick_m), 0.0, axis)
         self._maybe.clear()
 
-    def _again(self, tips: Tips) -> bool:
-        """Whether a hand that let go grips as wide as before: the same knob."""
-        before = self._before
-        return before is not None and abs(widened_m(tips, before)) <= self._settings.still_m
-
     def _follow(self, t_ns: int, tips: Tips) -> None:
         """Turn the dial, let it go, or grip it again."""
         own, grip = self._settings, self._grip
         if tips.known.sum() >= 3:
             self._known_ns = t_ns
         if grip is None:
-            axis = self._held(t_ns, tips, own.again_s, grips=self._again(tips))
+            before = self._before  # a hand that let go and grips as wide as before: the same knob
+            again = before is not None and abs(widened_m(tips, before)) <= own.still_m
+            axis = self._held(t_ns, tips, own.again_s, grips=again)
             if axis is not None:
                 self._take(tips, axis)
                 self._closed_ns = t_ns
@@ -251,12 +237,15 @@ class DialMonitor:
         self._angle = twist + 2.0 * pi * round((self._angle - twist) / (2.0 * pi))
         grip.history.push(t_ns, wide_m, self._angle)
 
-    def _message(self, dial: HeldGesture, phase: Phase, seen: HandFeatures, tips: Tips) -> Gesture:
+    def _turned(self, dial: Gesture, phase: Phase, seen: HandFeatures, tips: Tips) -> list[Gesture]:
+        """Return the message with the angle of an epoch."""
         grip = self._grip
         origin = 0.5 * seen.tips_m[0] + 0.5 * seen.tips_m[1:].mean(axis=0)
         way = seen.palmar if grip is None else tips.T_still_rig.T @ grip.axis
         confidence = float(tips.known.mean()) * (0.5 if grip is None else 1.0)
-        self._last = dial.message(
-            phase, seen.t_ns, confidence, angle_rad=self._angle, origin_m=origin, direction=way
+        if phase == "end":
+            self._grip = None
+            self._maybe.clear()
+        return self._send(
+            dial, phase, seen.t_ns, confidence, angle_rad=self._angle, origin_m=origin, direction=way
         )
-        return self._last

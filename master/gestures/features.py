@@ -304,25 +304,18 @@ def _take_seen(markers: Float, caps: Float) -> None:
     for f in range(5):
         own[f], least = -1, inf
         for m in range(markers.shape[0]):
-            apart = _apart(markers, m, caps, f)
+            apart = length(minus(point_at(markers, m), point_at(caps, f)))  # NaN where the marker is not seen
             if apart < least:
                 own[f], least = m, apart
         for g in range(5):
             own_m = 0.012  # a marker farther from where the hand has the cap is not this finger's
-            if least > own_m or _apart(markers, own[f], caps, g) < least:
+            if least > own_m or length(minus(point_at(markers, own[f]), point_at(caps, g))) < least:
                 own[f] = -1
                 break
     for f in range(5):
         if own[f] >= 0:
             for i in range(3):
                 caps[f, i] = markers[own[f], i]
-
-
-@inner
-def _apart(markers: Float, m: int, caps: Float, f: int) -> float:
-    """Distance [m] of a marker and a cap; NaN where the marker is not seen."""
-    x, y, z = markers[m, 0] - caps[f, 0], markers[m, 1] - caps[f, 1], markers[m, 2] - caps[f, 2]
-    return sqrt(x * x + y * y + z * z)
 
 
 _THUMB, _SIDE = constant(0), constant(2)
@@ -403,22 +396,26 @@ def _write(joints: Float, cov: Float, pads: Float, radius: Float, out: ThumbTouc
 
 
 @inner
-def _at(points: Float, j: int) -> Vector:
+def point_at(points: Float, j: int) -> Vector:
+    """Row j of points (N, 3)."""
     return points[j, 0], points[j, 1], points[j, 2]
 
 
 @inner
 def _on(joints: Float, a: int, b: int, share: float) -> Vector:
     """Return the point [m] at a share of the way from one joint to another."""
-    start, way = _at(joints, a), minus(_at(joints, b), _at(joints, a))
+    start, way = point_at(joints, a), minus(point_at(joints, b), point_at(joints, a))
     return start[0] + share * way[0], start[1] + share * way[1], start[2] + share * way[2]
 
 
 @inner
 def _shares(joints: Float, radius: Float, a: int, a_end: int, b: int, b_end: int) -> tuple[float, float]:
     """Where along two segments their skins are nearest, as `common.hand.skin`."""
-    u, v = minus(_at(joints, a_end), _at(joints, a)), minus(_at(joints, b_end), _at(joints, b))
-    apart = minus(_at(joints, b), _at(joints, a))
+    u, v = (
+        minus(point_at(joints, a_end), point_at(joints, a)),
+        minus(point_at(joints, b_end), point_at(joints, b)),
+    )
+    apart = minus(point_at(joints, b), point_at(joints, a))
     uu, vv, uv, au, bv, square = (
         dot(u, u),
         dot(v, v),
@@ -446,7 +443,7 @@ def _direction_sigma_rad(f: int, joints: Float, cov: Float) -> float:
     for i in range(3):
         for j in range(3):
             ends[i, j] = cov[a, i, j] + cov[b, i, j]
-    return spread(ends)[1] / length(minus(_at(joints, b), _at(joints, a)))
+    return spread(ends)[1] / length(minus(point_at(joints, b), point_at(joints, a)))
 
 
 @inner
@@ -473,10 +470,12 @@ def _palmar(f: int, s: int, joints: Float, pads: Float) -> Vector:
 
     The pad gives it for the last one; the others are turned back by the bends between.
     """
-    last = minus(_at(joints, CHAINS[f, 3]), _at(joints, CHAINS[f, 2]))
-    out = minus(_at(pads, f), _on(joints, CHAINS[f, 2], CHAINS[f, 3], PAD_SHARE))
+    last = minus(point_at(joints, CHAINS[f, 3]), point_at(joints, CHAINS[f, 2]))
+    out = minus(point_at(pads, f), _on(joints, CHAINS[f, 2], CHAINS[f, 3], PAD_SHARE))
     if s < 2:
         # The hinge goes across the finger, the same for all its segments but for twist.
-        out = cross(cross(last, out), minus(_at(joints, CHAINS[f, s + 1]), _at(joints, CHAINS[f, s])))
+        out = cross(
+            cross(last, out), minus(point_at(joints, CHAINS[f, s + 1]), point_at(joints, CHAINS[f, s]))
+        )
     n = length(out)
     return out[0] / n, out[1] / n, out[2] / n

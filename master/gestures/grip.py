@@ -12,11 +12,12 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.calibration.gesture_settings import DialSettings
 from common.geometry.transforms import quaternion_to_matrix
-from common.kernels import inner, kernel
+from common.kernels import constant, inner, kernel
 from master.fabrik.linear_algebra import diagonalise, dot
 from master.gestures.features import HandFeatures
 
 _EYE = np.eye(3)
+_ALL, _FINGERS = constant(0), constant(1)  # the first of all tips, and of those of the fingers
 
 
 class Tips(NamedTuple):
@@ -49,7 +50,7 @@ class Tips(NamedTuple):
         if self.known.sum() < 3:
             return None
         centre, axis = np.empty(3), np.empty(3)
-        _circle(self.place_m, self.known, self.palmar, centre, axis)
+        _circle(self, centre, axis)
         return axis
 
 
@@ -67,10 +68,8 @@ def may_grip(seen: HandFeatures, across_m: float, settings: DialSettings) -> boo
 def is_grip(seen: HandFeatures, tips: Tips, settings: DialSettings) -> bool:
     """Whether the tips of a hand that may grip lie about a knob."""
     return _about(
-        tips.place_m,
+        tips,
         (seen.pads_m - seen.tips_m) @ tips.T_still_rig.T,
-        tips.known,
-        tips.palmar,
         cos(settings.aslant_rad),
         settings.round_m,
         settings.opposed_rad,
@@ -82,10 +81,8 @@ def is_grip(seen: HandFeatures, tips: Tips, settings: DialSettings) -> bool:
 
 @kernel
 def _about(
-    place: Float,
+    tips: Tips,
     pads: Float,
-    known: Bool,
-    palmar: Float,
     aslant: float,
     round_m: float,
     opposed: float,
@@ -94,8 +91,9 @@ def _about(
     high: float,
 ) -> bool:
     """Whether tips are about a knob; pads (5, 3) are from the tip's middle."""
+    place, known, palmar = tips.place_m, tips.known, tips.palmar
     centre, axis = np.empty(3), np.empty(3)
-    radius = _circle(place, known, palmar, centre, axis)
+    radius = _circle(tips, centre, axis)
     if axis[0] * palmar[0] + axis[1] * palmar[1] + axis[2] * palmar[2] < aslant or not low <= radius <= high:
         return False
     good, a = 0, (axis[0], axis[1], axis[2])
@@ -124,12 +122,13 @@ def _about(
 
 
 @kernel
-def _circle(place: Float, known: Bool, palmar: Float, centre: Float, axis: Float) -> float:
-    """Radius of the circle of known places (5, 3); write its centre, its palmar axis.
+def _circle(tips: Tips, centre: Float, axis: Float) -> float:
+    """Radius of the circle of the known tips; write its centre, its palmar axis.
 
     The circle of least algebraic error (Kasa, 1976) in the plane of least squares. Along the principal axes
     of the places about their mean, its normal equations fall apart.
     """
+    place, known, palmar = tips.place_m, tips.known, tips.palmar
     count = 0
     for i in range(3):
         centre[i], count = 0.0, 0
@@ -180,18 +179,14 @@ def _along(place: Float, f: int, centre: Float, ways: Float, k: int) -> float:
     return total
 
 
-def rotation_between(now: Tips, then: Tips) -> Float:
-    """Rotation vector (3,) [rad] of the tips as one since `then`, by their variances."""
-    return _rotation_between(now.place_m, now.sigma_m, then.place_m, then.sigma_m)
-
-
 @kernel
-def _rotation_between(place: Float, sigma: Float, before: Float, sigma_before: Float) -> Float:
-    """Return the rotation vector (3,) from `before` to `place` (Horn, 1987)."""
+def rotation_between(now: Tips, then: Tips) -> Float:
+    """Rotation vector (3,) [rad] of all tips since `then` (Horn, 1987)."""
+    place, before = now.place_m, then.place_m
     weight, total = np.empty(5), 0.0
     middle, middle_before = np.zeros(3), np.zeros(3)
     for f in range(5):
-        sigma_m = hypot(sigma[f], sigma_before[f])
+        sigma_m = hypot(now.sigma_m[f], then.sigma_m[f])
         sigma_m = max(sigma_m, 1e-3) if isfinite(sigma_m) else 0.1
         weight[f] = 1.0 / (sigma_m * sigma_m)
         total += weight[f]
@@ -242,58 +237,53 @@ def axis_of(prior: Float, weight: float, rotation: Float) -> Float:
     return out
 
 
+@inner
+def _middles(tips: Tips, then: Tips, first: int, middle: Float, before: Float) -> int:
+    """Write the sums (3,) of places known now and then; return their number."""
+    count = 0
+    for f in range(first, 5):
+        if tips.known[f] and then.known[f]:
+            count += 1
+            for i in range(3):
+                middle[i] += tips.place_m[f, i]
+                before[i] += then.place_m[f, i]
+    return count
+
+
+@kernel
 def widened_m(tips: Tips, then: Tips) -> float:
     """By how much the grip is wider than `then` [m]; NaN: thumb or fingers not known.
 
     Half of what the thumb's tip has gone from those of the fingers.
     """
-    return _widened(tips.place_m, tips.known, then.place_m, then.known)
-
-
-@kernel
-def _widened(place: Float, known: Bool, before: Float, known_before: Bool) -> float:
-    count, now, then = 0, np.zeros(3), np.zeros(3)
-    for f in range(1, 5):
-        if known[f] and known_before[f]:
-            count += 1
-            for i in range(3):
-                now[i] += place[f, i]
-                then[i] += before[f, i]
-    if count < 2 or not (known[0] and known_before[0]):
+    middle, before = np.zeros(3), np.zeros(3)
+    count = _middles(tips, then, _FINGERS, middle, before)
+    if count < 2 or not (tips.known[0] and then.known[0]):
         return nan
     wide, wide_before = 0.0, 0.0
     for i in range(3):
-        wide += (place[0, i] - now[i] / count) ** 2
-        wide_before += (before[0, i] - then[i] / count) ** 2
+        wide += (tips.place_m[0, i] - middle[i] / count) ** 2
+        wide_before += (then.place_m[0, i] - before[i] / count) ** 2
     return 0.5 * (sqrt(wide) - sqrt(wide_before))
 
 
+@kernel
 def spread_m(tips: Tips, then: Tips) -> float:
     """Greatest change [m] since `then` of a known tip's distance from their middle.
 
     inf: fewer than three are known.
     """
-    return _spread(tips.place_m, tips.known, then.place_m, then.known)
-
-
-@kernel
-def _spread(place: Float, known: Bool, before: Float, known_before: Bool) -> float:
-    count, now, then = 0, np.zeros(3), np.zeros(3)
-    for f in range(5):
-        if known[f] and known_before[f]:
-            count += 1
-            for i in range(3):
-                now[i] += place[f, i]
-                then[i] += before[f, i]
+    middle, before = np.zeros(3), np.zeros(3)
+    count = _middles(tips, then, _ALL, middle, before)
     if count < 3:
         return inf
     most = 0.0
     for f in range(5):
-        if known[f] and known_before[f]:
+        if tips.known[f] and then.known[f]:
             away, away_before = 0.0, 0.0
             for i in range(3):
-                away += (place[f, i] - now[i] / count) ** 2
-                away_before += (before[f, i] - then[i] / count) ** 2
+                away += (tips.place_m[f, i] - middle[i] / count) ** 2
+                away_before += (then.place_m[f, i] - before[i] / count) ** 2
             most = max(most, abs(sqrt(away) - sqrt(away_before)))
     return most
 

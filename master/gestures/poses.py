@@ -40,9 +40,10 @@ from common.geometry.transforms import matrix_to_quaternion
 from common.hand.model import CHAINS, FINGERS, MIDDLE_PROXIMAL, WRIST, HandModel
 from common.kernels import constant, inner, kernel, log_if_slow
 from common.messages import JOINT_COUNT, Gesture, HandPose, Phase, Source
+from master.fabrik.linear_algebra import length, minus
 from master.gestures.actions import PinchMonitor, PointMonitor, ThumbTapMonitor, is_pad
 from master.gestures.dial import DialMonitor
-from master.gestures.features import FeatureExtractor, HandFeatures, thumb_touch
+from master.gestures.features import FeatureExtractor, HandFeatures, point_at, thumb_touch
 from master.gestures.grip import rehearse
 
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
@@ -78,6 +79,11 @@ class Quantities:
         )
         return cls(value, sigma)
 
+    @property
+    def known(self) -> Bool:
+        """(Q,) which of them are known at all."""
+        return np.isfinite(self.value) & np.isfinite(self.sigma)
+
 
 @kernel
 def _write(
@@ -95,9 +101,14 @@ def _write(
     """Write values and standard deviations (Q,); arguments as of `HandFeatures`."""
     sigma_deg = np.empty(5)
     for f in range(5):
-        lever = _length(joints, CHAINS[f, 1], CHAINS[f, 2]) + _length(joints, CHAINS[f, 2], CHAINS[f, 3])
+        pip, dip, tip = (
+            point_at(joints, CHAINS[f, 1]),
+            point_at(joints, CHAINS[f, 2]),
+            point_at(joints, CHAINS[f, 3]),
+        )
+        lever = length(minus(dip, pip)) + length(minus(tip, dip))
         sigma_deg[f] = degrees(tip_sigma_m[f] / lever)
-    size = _length(joints, _FROM, _TO)
+    size = length(minus(point_at(joints, _TO), point_at(joints, _FROM)))
     # Where they begin: index ... little, each MCP, PIP, both; and so on.
     thumb_bend, thumb_place, gaps, ahead, spreads = 12, 13, 16, 20, 22
     value[thumb_bend], sigma[thumb_bend] = degrees(bend[0, 1] + bend[0, 2]), sigma_deg[0]
@@ -140,13 +151,6 @@ def _write(
 
 
 @inner
-def _length(joints: Float, a: int, b: int) -> float:
-    """Distance of two joints [m]."""
-    x, y, z = joints[b, 0] - joints[a, 0], joints[b, 1] - joints[a, 1], joints[b, 2] - joints[a, 2]
-    return sqrt(x * x + y * y + z * z)
-
-
-@inner
 def _hidden(sigma: float, seen: bool) -> tuple[float, float]:
     """How far a finger is taken for hidden, 0..1, and its sigma [deg].
 
@@ -180,11 +184,6 @@ def known_bends(features: HandFeatures) -> tuple[list[float], list[bool]]:
     return [degrees(mcp + pip) for mcp, pip, _ in bends[1:]], features.known.tolist()[1:]
 
 
-def known_of(quantities: Quantities) -> Bool:
-    """(Q,) which of them are known at all."""
-    return np.isfinite(quantities.value) & np.isfinite(quantities.sigma)
-
-
 class Fit(NamedTuple):
     """How well each pose fits one hand, in the order of `PoseTable.names`.
 
@@ -192,12 +191,14 @@ class Fit(NamedTuple):
         score: (P,) 0..1, each for itself, by what is known.
         confidence: (P,) 0..1, against the others.
         known: (P,) enough of its quantities are known, and the fingers that it needs.
+        residuals: (P, Q) distance to each pose's ranges in sigmas; 0 inside, and without a range.
         best: The most confident pose of which enough is known; -1: there is none.
     """
 
     score: Float
     confidence: Float
     known: Bool
+    residuals: Float
     best: int
 
 
@@ -243,22 +244,14 @@ class PoseTable:
                 at = row, QUANTITIES.index(name)
                 own.asked[at], own.low[at], own.high[at], own.soft[at] = True, span.low, span.high, span.soft
 
-    def residuals(self, quantities: Quantities) -> Float:
-        """Distance to each pose's ranges (P, Q) in sigmas; 0 inside, and without a range."""
-        return self._fit(quantities, np.ones(len(FINGERS), np.bool_))[1]
-
     def fit(self, quantities: Quantities, known: Bool) -> Fit:
         """How well each pose fits; `known` (5,) is which fingers are."""
-        return self._fit(quantities, known)[0]
-
-    def _fit(self, quantities: Quantities, known: Bool) -> tuple[Fit, Float]:
-        """The fit, and the residuals (P, Q)."""
         poses, residuals = len(self.names), np.zeros(self._table.low.shape)
         score, confidence, enough = np.empty(poses), np.empty(poses), np.empty(poses, np.bool_)
         best = _fit(
             self._table, quantities.value, quantities.sigma, known, residuals, score, confidence, enough
         )
-        return Fit(score, confidence, enough, best), residuals
+        return Fit(score, confidence, enough, residuals, best)
 
 
 @kernel
@@ -441,7 +434,7 @@ class PoseRecogniser:
         )
 
 
-class ActionMonitor:
+class Actions:
     """The four detectors of actions, of which one at most is active."""
 
     def __init__(self, settings: GestureSettings, radius_m: Float) -> None:
@@ -481,7 +474,7 @@ class GestureRecogniser:
 
     def __init__(self, settings: GestureSettings, model: HandModel) -> None:
         self._features, self._poses = FeatureExtractor(model), PoseRecogniser(settings)
-        self._actions = ActionMonitor(settings, model.radius_m)
+        self._actions = Actions(settings, model.radius_m)
         with log_if_slow():
             self._rehearse(settings, model)
 
@@ -490,7 +483,7 @@ class GestureRecogniser:
         seen = self._features.of(_at_rest(model))
         assert seen is not None
         PoseRecogniser(settings).push(seen)
-        ActionMonitor(settings, model.radius_m).push(seen)
+        Actions(settings, model.radius_m).push(seen)
         rehearse(seen)
 
     def push(self, pose: HandPose) -> list[Gesture]:

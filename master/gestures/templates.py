@@ -24,16 +24,13 @@ from common.errors import FitError
 from common.hand.model import FINGERS, HandModel
 from common.messages import HandPose
 from master.gestures.features import FeatureExtractor, HandFeatures
-from master.gestures.poses import QUANTITIES, FingerSpeed, PoseTable, Quantities, known_bends, known_of
+from master.gestures.poses import QUANTITIES, FingerSpeed, PoseTable, Quantities, known_bends
 
 FEWEST = 3  # examples
 SHORTEST = 5  # frames of one
 _FLOOR: Mapping[str, float] = {"deg": 7.0, "mm": 7.0, "": 0.09}  # by unit: what a hold varies from day to day
-_WIDEST: Mapping[str, float] = {
-    "deg": 25.0,
-    "mm": 25.0,
-    "": 0.35,
-}  # examples that differ by more show no one pose
+# Examples that differ by more show no one pose.
+_WIDEST: Mapping[str, float] = {"deg": 25.0, "mm": 25.0, "": 0.35}
 _ASKED: tuple[Quantity, ...] = (
     *("index_mcp_deg", "index_pip_deg", "middle_mcp_deg", "middle_pip_deg"),
     *("ring_mcp_deg", "ring_pip_deg", "little_mcp_deg", "little_pip_deg"),
@@ -64,15 +61,11 @@ class Example:
         if len(frames) < SHORTEST:
             raise FitError(f"an example of {len(frames)} frames: hold it longer, for {SHORTEST} at least")
         each = [Quantities.of(frame) for frame in frames]
-        measured = np.array([known_of(one) for one in each])
+        measured = np.array([one.known for one in each])
         known_share = 0.6  # of an example's frames
         enough = measured.mean(axis=0) >= known_share
-        value = np.array(
-            [np.where(known, one.value, np.nan) for known, one in zip(measured, each, strict=True)]
-        )
-        sigma = np.array(
-            [np.where(known, one.sigma, np.nan) for known, one in zip(measured, each, strict=True)]
-        )
+        value = np.where(measured, np.array([one.value for one in each]), np.nan)
+        sigma = np.where(measured, np.array([one.sigma for one in each]), np.nan)
         known = np.mean([frame.known for frame in frames], axis=0) >= known_share
         medians = [np.full(len(QUANTITIES), fill) for fill in (0.0, np.inf)]
         for median, of in zip(medians, (value, sigma), strict=True):
@@ -126,7 +119,7 @@ def learn(
 
 def _shape(name: str, examples: Sequence[Example], weight: float) -> PoseShape:
     """Ranges of what is known in all examples."""
-    known = np.all([known_of(example.quantities) for example in examples], axis=0)
+    known = np.all([example.quantities.known for example in examples], axis=0)
     value = np.array([example.quantities.value for example in examples])
     total_sigma = np.sqrt(
         np.mean([np.where(known, example.quantities.sigma, 0.0) ** 2 for example in examples], axis=0)
@@ -171,11 +164,8 @@ def _refuse_alike(
         back = _scores(shape, [middle])[0] if middle is not None else 0.0
         like = 0.25  # an example that another pose fits so well would be called by its name
         if max(fits, back) >= like:
-            hint = (
-                ""
-                if middle is not None
-                else f", or, where it is a special case of it, say so (--within {other})"
-            )
+            special = f", or, where it is a special case of it, say so (--within {other})"
+            hint = "" if middle is not None else special
             raise FitError(
                 f"{name}: too like {other!r}, which fits by {max(fits, back):.2f}; {_difference(other, of, examples)}."
                 f" Show a pose that differs more{hint}"
@@ -200,7 +190,7 @@ def _scores(shape: PoseShape, examples: Sequence[Example]) -> list[float]:
 
 def _residuals(shape: PoseShape, example: Example) -> Float:
     alone = GestureSettings(version=1, name="alone", poses={"one": shape})
-    return PoseTable(alone).residuals(example.quantities)[0]
+    return PoseTable(alone).fit(example.quantities, example.known).residuals[0]
 
 
 def _difference(other: str, shape: PoseShape, examples: Sequence[Example]) -> str:
@@ -224,11 +214,10 @@ def _agreement(name: str, examples: Sequence[Example]) -> float:
     """Worst leave-one-out fit of an example; of three, too few for it, to the whole."""
     if len(examples) <= FEWEST:
         return min(_scores(_shape(name, examples, 1.0), examples))
-    out: list[float] = []
-    for k, example in enumerate(examples):
-        rest = [*examples[:k], *examples[k + 1 :]]
-        out += _scores(_shape(name, rest, 1.0), [example])
-    return min(out)
+    return min(
+        _scores(_shape(name, [*examples[:k], *examples[k + 1 :]], 1.0), [example])[0]
+        for k, example in enumerate(examples)
+    )
 
 
 def _unit(quantity: str) -> str:

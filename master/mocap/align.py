@@ -142,7 +142,8 @@ def align(ours: Track, theirs: Track) -> Alignment:
         FitError: They do not move alike, share too little, or all points lie on a line.
     """
     offset_ns, correlation, alternative_s = clock_offset(ours, theirs)
-    rows = _rows(ours)
+    most_rows, count = 4000, len(ours.t_ns)
+    rows = np.unique(np.linspace(0, count - 1, min(count, most_rows)).astype(np.int64))  # evenly
     target = ours.position_m[rows]
     start = [_registered(theirs.at(ours.t_ns[rows] - offset_ns), target, mirror) for mirror in (False, True)]
     mirrored = start[1][1] < 0.5 * start[0][1]  # median residual
@@ -161,11 +162,6 @@ def align(ours: Track, theirs: Track) -> Alignment:
         alternative_s=alternative_s,
         mirrored=mirrored,
     )
-
-
-def _rows(ours: Track) -> Int:
-    """At most some thousand rows, evenly."""
-    return np.unique(np.linspace(0, len(ours.t_ns) - 1, min(len(ours.t_ns), 4000)).astype(np.int64))
 
 
 def _registered(source: Float, target: Float, mirror: bool) -> tuple[Float, float]:

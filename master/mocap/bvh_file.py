@@ -170,8 +170,6 @@ def read_bvh(path: Path) -> PointTable:
         RecordingError: It cannot be read, or is no BVH; with what is wrong.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise RecordingError(f"{path}: larger than 1 GiB: cut it")
         text = path.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
         raise RecordingError(f"{path}: cannot read: {error.strerror}") from error

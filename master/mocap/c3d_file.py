@@ -9,7 +9,7 @@ import c3d
 import numpy as np
 
 from common.errors import RecordingError
-from master.mocap.bvh_file import MAX_BYTES, PointTable, Unit
+from master.mocap.bvh_file import PointTable, Unit
 
 _UNITS: dict[str, Unit] = {"m": "m", "cm": "cm", "mm": "mm", "in": "in"}
 _BROKEN = (
@@ -32,8 +32,6 @@ def read_c3d(path: Path) -> PointTable:
         RecordingError: It cannot be read, or has no labelled points.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise RecordingError(f"{path}: larger than 1 GiB: cut it")
         with path.open("rb") as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # it warns of files without analog channels
             reader = cast(Any, c3d).Reader(file)

@@ -20,6 +20,7 @@ from common.hand.model import FINGER_JOINTS, FINGERS, JOINTS, WRIST
 from master.mocap.align import Alignment
 from master.mocap.bvh_file import JointMotion, Track, known
 from master.outputs.poses import Poses
+from master.recording.export.motion import back, rotate
 
 CLASSES = ("wrist", "palm", "metacarpal", "phalanx-proximal", "phalanx-intermediate", "phalanx-distal", "tip")
 _ANGLES = ("mcp", "pip", "dip")
@@ -86,6 +87,7 @@ def compare(
     valid = poses.valid[inside] & known(poses.position_m[inside])
     found = np.where(valid[..., None], poses.position_m[inside], np.nan)
     off = found - exact
+    bases = np.asarray(known(exact).any(axis=0), np.bool_)  # joints that the truth has, metacarpals or not
     names = tuple(name for name in marker_names if name in motion.names)
     own = Track(motion.t_ns, np.stack([motion.of(name) for name in names], axis=1)) if names else None
     rows = [marker_names.index(name) for name in names]
@@ -99,10 +101,10 @@ def compare(
         known=known(exact),
         tracked=poses.tracked[inside] & valid & known(exact),
         chi2=_chi2(off, poses.cov_m2[inside]),
-        angle_deg=_angle_errors(found, exact),
+        angle_deg=np.abs(_angles(found, bases) - _angles(exact, bases)),
         marker_mm=marker_mm,
         marker_names=names,
-        own_frame_m=_in_joint_axes(off, poses.orientation_wxyz[inside]),
+        own_frame_m=rotate(back(poses.orientation_wxyz[inside]), off),
     )
 
 
@@ -113,19 +115,6 @@ def _chi2(off_m: Float, cov_m2: Float) -> Float:
     cov = np.where(stated[..., None, None], cov_m2, np.eye(3)) + floor_m2 * np.eye(3)
     value = (off_m * np.linalg.solve(cov, off_m[..., None])[..., 0]).sum(axis=2)
     return np.where(stated | np.isnan(value), value, np.inf)
-
-
-def _in_joint_axes(off_m: Float, q_wxyz: Float) -> Float:
-    """Vectors (T, 26, 3) in the axes of their joints."""
-    w, axis = q_wxyz[..., :1], -q_wxyz[..., 1:]
-    side = 2.0 * np.cross(axis, off_m)
-    return off_m + w * side + np.cross(axis, side)
-
-
-def _angle_errors(found: Float, exact: Float) -> Float:
-    """|Errors| (T, 5, 3) [deg] of the angles between bones."""
-    bases = np.asarray(known(exact).any(axis=0), np.bool_)
-    return np.abs(_angles(found, bases) - _angles(exact, bases))
 
 
 def _angles(joints: Float, bases: Bool) -> Float:
@@ -149,7 +138,10 @@ def figures(compared: Compared) -> dict[str, object]:
     """All metrics by name: hand, classes of joint, fingers, angles; None: no data."""
     every = np.ones(26, np.bool_)
     fingers = {name: _finger_figures(compared, f) for f, name in enumerate(FINGERS)}
-    classes = {kind: _figures(compared, _of_class(kind)) for kind in CLASSES}
+    classes = {
+        kind: _figures(compared, np.array([f"-{name}".endswith(f"-{kind}") for name in JOINTS]))
+        for kind in CLASSES
+    }
     angles = {name: _spread(compared.angle_deg[:, 1:, k], "deg") for k, name in enumerate(_ANGLES)}
     markers = {name: _spread(compared.marker_mm[:, k], "mm") for k, name in enumerate(compared.marker_names)}
     return {
@@ -162,10 +154,6 @@ def figures(compared: Compared) -> dict[str, object]:
         "fingers": fingers,
         "markers": markers,
     }
-
-
-def _of_class(kind: str) -> Bool:
-    return np.array([name == kind or name.endswith(f"-{kind}") for name in JOINTS])
 
 
 def _finger_figures(compared: Compared, finger: int) -> dict[str, object]:

@@ -17,7 +17,8 @@ seen; the others leave it empty.
 import csv
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import cast
 
@@ -25,7 +26,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.errors import RecordingError
-from master.mocap.bvh_file import MAX_BYTES, PointTable, Unit
+from master.mocap.bvh_file import PointTable, Unit
 
 
 def read_rows(path: Path) -> list[list[str]]:
@@ -35,8 +36,6 @@ def read_rows(path: Path) -> list[list[str]]:
         RecordingError: It cannot be read, is too large or no text.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise RecordingError(f"{path}: larger than 1 GiB: cut it")
         text = path.read_text(encoding="utf-8-sig")
         head = text[:20_000]
         separator = max("\t;,", key=head.count)
@@ -119,7 +118,7 @@ def _motive(rows: list[list[str]], path: Path) -> PointTable:
             points.setdefault(names[at], {})[axes[at]] = at
     columns = {name: [own[axis] for axis in "XYZ"] for name, own in points.items() if len(own) == 3}
     unit = _UNITS.get(pairs.get("Length Units", "").lower())
-    body = _until_empty(rows[head + 1 :])
+    body = list(takewhile(any, rows[head + 1 :]))  # behind an empty row other tables begin
     return _table(body, head + 2, path, columns, unit, time_column=1)
 
 
@@ -136,9 +135,9 @@ def _vicon(rows: list[list[str]], path: Path) -> PointTable:
     }
     cells = rows[head + 1]
     unit = _UNITS.get(next((cell.lower() for cell in cells if cell), ""))
-    body = _until_empty(rows[head + 2 :])
+    body = list(takewhile(any, rows[head + 2 :]))
     table = _table(body, head + 3, path, columns, unit, time_column=0)
-    return PointTable(table.names, table.t_s / rate, table.position, unit)
+    return replace(table, t_s=table.t_s / rate)
 
 
 def _qualisys(rows: list[list[str]], path: Path, rate_hz: float | None) -> PointTable:
@@ -147,14 +146,13 @@ def _qualisys(rows: list[list[str]], path: Path, rate_hz: float | None) -> Point
     rate = rate_hz if rate_hz is not None else _rate((keys.get("FREQUENCY", (0, [""]))[1] or [""])[0], path)
     last = max(k for k, _ in keys.values())
     start = next((k for k in range(last + 1, len(rows)) if rows[k] and _is_number(rows[k][0])), len(rows))
-    body = _until_empty(rows[start:])
+    body = list(takewhile(any, rows[start:]))
     ahead = max(len(row) for row in body) - 3 * len(names) if body else 0
     ahead = 2 if ahead >= 2 else 0  # frame and time, where they were exported
     columns = {name: [ahead + 3 * k + axis for axis in range(3)] for k, name in enumerate(names)}
     table = _table(body, start + 1, path, columns, "mm", time_column=None)
     unseen = (table.position == 0.0).all(axis=2, keepdims=True)
-    t_s = np.arange(len(body)) / rate
-    return PointTable(table.names, t_s, np.where(unseen, np.nan, table.position), "mm")
+    return replace(table, t_s=table.t_s / rate, position=np.where(unseen, np.nan, table.position))
 
 
 def _is_number(cell: str) -> bool:
@@ -169,11 +167,6 @@ def _rate(cell: str, path: Path) -> float:
     if not _is_number(cell) or not 0.0 < float(cell) < 1e6:
         raise RecordingError(f"{path}: the frames a second are {cell[:40]!r}: no rate; give --rate")
     return float(cell)
-
-
-def _until_empty(rows: list[list[str]]) -> list[list[str]]:
-    """The rows up to an empty one, behind which other tables of the file begin."""
-    return rows[: next((k for k, row in enumerate(rows) if not any(row)), len(rows))]
 
 
 def _table(
@@ -225,20 +218,14 @@ def _plain(rows: list[list[str]], path: Path, rate_hz: float | None) -> PointTab
         raise RecordingError(f"{path}: is empty")
     columns = _columns(rows[start], path)
     body = [row for row in rows[start + 1 :] if any(row)]
-    wanted = [at for three in columns.points.values() for at in three]
-    times = [] if columns.time is None else [columns.time]
-    values = numbers(body, start + 2, times + wanted, path)
-    if times:
-        t_s = values[:, 0] * columns.seconds
-    elif rate_hz is not None:
-        t_s = np.arange(len(values)) / rate_hz
-    else:
+    if columns.time is None and rate_hz is None:
         raise RecordingError(
             f"{path}: has no column of time (t_ns, t_ms, time, seconds): add one, or give its frames a second:"
             " --rate"
         )
-    position = values[:, len(times) :].reshape(len(values), len(columns.points), 3)
-    return PointTable(tuple(columns.points), t_s, position, columns.unit)
+    table = _table(body, start + 2, path, columns.points, columns.unit, columns.time)
+    t_s = table.t_s * columns.seconds if columns.time is not None else table.t_s / (rate_hz or 1.0)
+    return replace(table, t_s=t_s)
 
 
 def _columns(header: list[str], path: Path) -> _Columns:

@@ -21,6 +21,7 @@ from common.calibration.files import read_json
 from common.errors import RecordingError
 from common.hand.model import FINGER_JOINTS, JOINTS
 from master.mocap.bvh_file import (
+    MAX_BYTES,
     METRES,
     POINTS,
     JointMotion,
@@ -335,6 +336,8 @@ def _table(path: Path, rate_hz: float | None) -> PointTable:
     suffix = path.suffix.lower()
     if not path.is_file():
         raise RecordingError(f"{path}: no such file: give {_FORMS}")
+    if path.stat().st_size > MAX_BYTES:
+        raise RecordingError(f"{path}: larger than 1 GiB: cut it")
     if suffix == ".bvh":
         return read_bvh(path)
     if suffix == ".c3d":

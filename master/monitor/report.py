@@ -69,7 +69,7 @@ class Reporter:
         ingest: Ingest,
         dispatcher: Dispatcher,
         extrinsics: Sequence[tuple[ExtrinsicsMonitor, LivePipeline]],
-        tuning: RigTuning | None,
+        tuning: RigTuning,
         monitor: ClockMonitor,
         figures: RunFigures,
         probe: Probe,
@@ -90,8 +90,7 @@ class Reporter:
         """Return the health; of what never happened only `received`, to keep it short."""
         events = self._ingest.counts | self._bus.counts
         happened = {name: number for name, number in events.items() if number or name.endswith("received")}
-        changes = {} if self._tuning is None else self._tuning.counts()
-        counts = dict(self._dispatcher.counts) | happened | changes | self._probe.counts
+        counts = dict(self._dispatcher.counts) | happened | self._tuning.counts() | self._probe.counts
         times = dict(self._monitor.metrics(self._ingest.clock_of)) | (
             {"open_bus": 1.0} if self._bus.open else {}
         )
@@ -107,10 +106,13 @@ class Reporter:
             CalibrationError: The files cannot be used; the old ones still are.
             ValueError: Another verb; the asker reads which ones there are.
         """
-        verbs = {"report": lambda: None, "stop": self._stop.set, "tap": self._probe.lease}
-        if self._tuning is not None:
-            tuning = self._tuning
-            verbs |= {"reload": tuning.reload, "filter": lambda: tuning.try_filter(command.body)}
+        verbs = {
+            "report": lambda: None,
+            "stop": self._stop.set,
+            "tap": self._probe.lease,
+            "reload": self._tuning.reload,
+            "filter": lambda: self._tuning.try_filter(command.body),
+        }
         if command.verb not in verbs:
             raise ValueError(f"{MASTER}: no command {command.verb!r}; there are {', '.join(verbs)}")
         verbs[command.verb]()
@@ -148,10 +150,9 @@ class Reporter:
     def _looked(self) -> list[str]:
         """Lines of the monitors; what senders send may fail one, but not the report."""
         try:
-            if self._tuning is not None:
-                self._tuning.look()
-                self._monitor.follow(self._tuning.setups)
-                self._ingest.limit(limits_of(self._tuning.setups))
+            self._tuning.look()
+            self._monitor.follow(self._tuning.setups)
+            self._ingest.limit(limits_of(self._tuning.setups))
             lines = self._monitor.look()
             lines += [
                 line for extrinsics, pipeline in self._extrinsics for line in extrinsics.look(pipeline.counts)

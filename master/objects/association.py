@@ -16,6 +16,7 @@ than numbers are exact.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
+from operator import itemgetter
 
 import numpy as np
 
@@ -45,16 +46,13 @@ def poses_of_tags(
     sighted: Sequence[Sighted], features: Features, cameras: tuple[CameraModel, ...]
 ) -> list[Float]:
     """Return two poses `T_rig_object` (4, 4), likelier first, by tag and camera."""
-    poses: list[tuple[float, Float]] = []
-    for seen in sighted:
-        if seen.feature >= features.beads:
-            camera = cameras[seen.camera]
-            own = features.points[features.corners_of(seen.feature - features.beads)]
-            poses += [
-                (miss, camera.T_rig_camera @ T) for miss, T in two_poses(own, camera.undistort(seen.uv[0]))
-            ]
-    poses.sort(key=lambda pose: pose[0])
-    return [T for _, T in poses]
+    poses = [
+        (miss, cameras[seen.camera].T_rig_camera @ T)
+        for seen in sighted
+        if seen.feature >= features.beads
+        for miss, T in two_poses(features.corners_m(seen.feature), cameras[seen.camera].undistort(seen.uv[0]))
+    ]
+    return [T for _, T in sorted(poses, key=itemgetter(0))]
 
 
 def two_poses(corners: Float, xy: Float) -> list[tuple[float, Float]]:
@@ -94,7 +92,7 @@ def _ways(A: Float, rotation: Float, corners: Float, flat: Float, xy: Float) -> 
         seen = corners @ T[:3, :3].T + T[:3, 3]
         if (seen[:, 2] > 0.0).all():
             out.append((float(np.linalg.norm(seen[:, :2] / seen[:, 2:] - xy)), T))
-    return sorted(out, key=lambda way: way[0])
+    return sorted(out, key=itemgetter(0))
 
 
 def _homography(plane: Float, xy: Float) -> Float | None:
@@ -143,9 +141,7 @@ def poses_of_beads(sighted: Sequence[Sighted], features: Features, cameras: Came
             distance_m, distance_share = 8e-3, 0.08  # by which distances between beads may be wrong
             if (off < distance_m + distance_share * wanted).all():
                 poses.append((float(off.sum()), fit_rigid(points, own)))
-    poses.sort(key=lambda pose: pose[0])
-    # poses
-    return [T for _, T in poses[:6]]
+    return [T for _, T in sorted(poses, key=itemgetter(0))[:6]]
 
 
 def _points(sighted: Sequence[Sighted], bead: int, cameras: CameraArrays) -> Float:
@@ -167,80 +163,48 @@ def _sides(points: Float) -> Float:
     return np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1)
 
 
-def reach(taus: Float) -> Int:
-    """Select the two times, nearest first, that carry an image position to 0.
-
-    `taus` (n,) are times from an epoch [s]. Returns one index where only one is usable.
-    """
-    order: Int = np.argsort(np.abs(taus))
-    near_s = 0.012  # frames of several cameras that are taken for one moment without bringing them there
-    if len(order) < 2 or abs(float(taus[order[1]])) > 4 * near_s:
-        return order[:1]
-    return order[:2]
-
-
 CentroidSigma = Callable[[int, Float, Float], Float]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Association:
-    """Observations of a window, one image position for each of `feature` (n,)."""
+def observations_of(
+    window: Window,
+    features: Features,
+    cameras: tuple[CameraModel, ...],
+    T: Float | None,
+    centroid_sigma: CentroidSigma,
+) -> Observations | None:
+    """All that is seen in a window; None: nothing.
 
-    seen: Observations
-    feature: Int
-    now: Bool
-    features: int
-    cameras: int
-
-    @classmethod
-    def of(
-        cls,
-        window: Window,
-        features: Features,
-        cameras: tuple[CameraModel, ...],
-        T: Float | None,
-        centroid_sigma: CentroidSigma,
-    ) -> "Association | None":
-        """All that is seen; None: nothing.
-
-        `T`: a pose (4, 4) near which the object is; of two places of a bead the nearer to it is taken.
-        `centroid_sigma`: camera, pose and areas (..., B) [px^2] of its beads -> by how much their centroids
-        may be off [px].
-        """
-        columns: list[tuple[Int, Int, Float, Float, Float, Float, Bool]] = []
-        for c, both in enumerate(window.views):
-            for kind, line in enumerate(both):
-                observed = [observation for observation in line if len(observation.point)]
-                if not observed:
-                    continue
-                point = np.concatenate([one.point for one in observed])
-                uv, sigma = _nearer(observed, point, features, cameras[c], T)
-                if T is not None and kind == 0:
-                    area = np.concatenate([one.area_px2 for one in observed]).reshape(len(observed), -1)
-                    sigma = np.hypot(sigma, centroid_sigma(c, T, area).ravel())
-                there: Int = np.flatnonzero(np.isfinite(uv[:, 0] + uv[:, 1] + sigma))
-                t_ns = np.concatenate([one.t_ns for one in observed])
-                size = [len(one.point) for one in observed]
-                late = np.repeat([one.t_sigma_s for one in observed], size)
-                near = window.near(c, kind)
-                now = np.repeat([one is near for one in observed], size)
-                tau = (t_ns[there] - (window.t_ns - window.origin_ns)) * 1e-9
-                at = np.full(len(there), c)
-                columns.append((at, point[there], tau, uv[there], sigma[there], late[there], now[there]))
-        if not sum(len(column[0]) for column in columns):
-            return None
-        camera, point, tau, uv, sigma, t_sigma, now = (
-            np.concatenate(column) for column in zip(*columns, strict=True)
-        )
-        seen = Observations(camera, point, tau, uv, sigma, t_sigma)
-        return cls(seen, features.feature[point], now, features.count, len(cameras))
-
-    def used(self, fitted: Fitted) -> Bool:
-        """Return (C, F) features by camera that a pose rests on in the nearest frames."""
-        out = np.zeros((self.cameras, self.features), np.bool_)
-        associated = fitted.used & self.now
-        out[self.seen.camera[associated], self.feature[associated]] = True
-        return out
+    `T`: a pose (4, 4) near which the object is; of two places of a bead the nearer to it is taken.
+    `centroid_sigma`: camera, pose and areas (..., B) [px^2] of its beads -> by how much their centroids may be
+    off [px].
+    """
+    columns: list[tuple[Int, Int, Float, Float, Float, Float, Bool]] = []
+    for c, both in enumerate(window.views):
+        for kind, line in enumerate(both):
+            observed = [observation for observation in line if len(observation.point)]
+            if not observed:
+                continue
+            point = np.concatenate([one.point for one in observed])
+            uv, sigma = _nearer(observed, point, features, cameras[c], T)
+            if T is not None and kind == 0:
+                area = np.concatenate([one.area_px2 for one in observed]).reshape(len(observed), -1)
+                sigma = np.hypot(sigma, centroid_sigma(c, T, area).ravel())
+            there: Int = np.flatnonzero(np.isfinite(uv[:, 0] + uv[:, 1] + sigma))
+            t_ns = np.concatenate([one.t_ns for one in observed])
+            size = [len(one.point) for one in observed]
+            late = np.repeat([one.t_sigma_s for one in observed], size)
+            near = window.near(c, kind)
+            now = np.repeat([one is near for one in observed], size)
+            tau = (t_ns[there] - (window.t_ns - window.origin_ns)) * 1e-9
+            at = np.full(len(there), c)
+            columns.append((at, point[there], tau, uv[there], sigma[there], late[there], now[there]))
+    if not sum(len(column[0]) for column in columns):
+        return None
+    camera, point, tau, uv, sigma, t_sigma, now = (
+        np.concatenate(column) for column in zip(*columns, strict=True)
+    )
+    return Observations(camera, point, tau, uv, sigma, t_sigma, features.feature[point], now)
 
 
 def _nearer(
@@ -278,18 +242,18 @@ def sighted_now(window: Window, features: Features) -> list[Sighted]:
 
 def _brought(points: Int, line: tuple[ImageObservation, ...], at_ns: int) -> Float:
     """Extrapolate the nearest observation's points (n, 2) to a time, by the next."""
-    found: list[tuple[Float, Float]] = []
+    found: list[tuple[Float, Float]] = []  # points, and their times from the epoch [s]
     for observation in line:
         rows = [
             int(np.flatnonzero(observation.point == p)[0]) for p in points if (observation.point == p).any()
         ]
         if len(rows) == len(points) and np.isfinite(observation.uv[rows]).all():
             found.append((observation.uv[rows], (observation.t_ns[rows] - at_ns) * 1e-9))
-    associated = reach(np.array([tau[0] for _, tau in found]))
-    if len(associated) < 2:
+    order: list[int] = np.argsort([abs(tau[0]) for _, tau in found]).tolist()
+    far_s = 0.048  # an observation farther away says nothing about the motion now
+    if len(order) < 2 or abs(found[order[1]][1][0]) > far_s:
         return found[0][0]
-    uv, tau = found[int(associated[0])]
-    other, other_tau = found[int(associated[1])]
+    (uv, tau), (other, other_tau) = found[order[0]], found[order[1]]
     return uv - (tau / (other_tau - tau))[:, None] * (other - uv)
 
 
@@ -318,7 +282,7 @@ class SingleTag:
         """Begin anew: what is seen is another thing."""
         self._log_odds, self._clear = 0.0, None
 
-    def of_two(self, window: Window, seen: Association, fitted: Fitted, *, begins: bool) -> Fitted:
+    def of_two(self, window: Window, seen: Observations, fitted: Fitted, *, begins: bool) -> Fitted:
         """Return the pose to use, its covariance widened by that of a lone tag's other.
 
         `begins`: there is no pose before it: the better one is taken at once.
@@ -330,7 +294,7 @@ class SingleTag:
             self._clear = None
             return fitted
         feature = int(features[0])
-        who = (feature, *np.unique(seen.seen.camera[fitted.used]).tolist())
+        who = (feature, *np.unique(seen.camera[fitted.used]).tolist())
         clear = self._clear
         if clear is not None and clear.seen_by == who and clear.frames > 0 and not begins:
             clear.frames -= 1
@@ -356,9 +320,9 @@ class SingleTag:
             self._clear = _Clear(who, better, unlooked)
         return _reaching(fitted, other, better)
 
-    def _other(self, window: Window, seen: Association, fitted: Fitted, feature: int) -> Fitted | None:
+    def _other(self, window: Window, seen: Observations, fitted: Fitted, feature: int) -> Fitted | None:
         """The fit of the only tag's other pose, where there is another."""
-        own = self._features.points[self._features.corners_of(feature - self._features.beads)]
+        own = self._features.corners_m(feature)
         best: Fitted | None = None
         for sighted in sighted_now(window, self._features):
             if sighted.feature != feature:
@@ -368,7 +332,7 @@ class SingleTag:
                 there = camera.T_rig_camera @ T
                 if _rotated(there, fitted.motion.T) < _FLIP_RAD:
                     continue
-                other = self._fit(seen.seen, Motion.still(there), feature=seen.feature)
+                other = self._fit(seen, Motion.still(there))
                 if other is None or _rotated(other.motion.T, fitted.motion.T) < _FLIP_RAD:
                     continue
                 if best is None or other.cost < best.cost:

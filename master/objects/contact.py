@@ -19,7 +19,6 @@ same.
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -42,20 +41,12 @@ from master.objects.surface import Nearest, Surface
 SPAN_S = 0.35  # over which motions are compared
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Moment:
-    """Object `T_rig_object` (4, 4) and palm (3,) [m], rig frame, at a time."""
-
-    t_ns: int
-    T: Float
-    palm_m: Float
-
-
 class Carried:
     """Push machine: whether a hand carries an object, by how both moved of late."""
 
     def __init__(self) -> None:
-        self._moments: deque[_Moment] = deque()
+        # Time [ns], object `T_rig_object` (4, 4), palm (3,) [m] of late.
+        self._moments: deque[tuple[int, Float, Float]] = deque()
         self._at_m: Float | None = None
 
     def push(self, t_ns: int, T_rig_object: Float, palm_m: Float, distance_m: float, away: bool) -> bool:
@@ -67,10 +58,10 @@ class Carried:
         if np.isnan(palm_m).any() or np.isnan(distance_m):
             return self._at_m is not None and not away
         gap_s = 0.1
-        if self._moments and t_ns - self._moments[-1].t_ns > gap_s * 1e9:
+        if self._moments and t_ns - self._moments[-1][0] > gap_s * 1e9:
             self._moments.clear()
-        self._moments.append(_Moment(t_ns, T_rig_object, palm_m))
-        while t_ns - self._moments[0].t_ns > SPAN_S * 1e9:
+        self._moments.append((t_ns, T_rig_object, palm_m))
+        while t_ns - self._moments[0][0] > SPAN_S * 1e9:
             self._moments.popleft()
         at_m = transform(invert(T_rig_object), palm_m)
         near_m = 0.05  # between palm and object, at most
@@ -92,14 +83,14 @@ class Carried:
         self._moments.clear()
 
     def _goes_along(self) -> bool:
-        first, last = self._moments[0], self._moments[-1]
-        if last.t_ns - first.t_ns < 0.5 * SPAN_S * 1e9:
+        (first_ns, T_first, palm_first), (last_ns, T_last, palm_last) = self._moments[0], self._moments[-1]
+        if last_ns - first_ns < 0.5 * SPAN_S * 1e9:
             return False
-        to = transform(last.T @ invert(first.T), first.palm_m)
-        way = float(np.linalg.norm(to - first.palm_m))
+        to = transform(T_last @ invert(T_first), palm_first)
+        way = float(np.linalg.norm(to - palm_first))
         way_m = 0.015  # of the palm, at least: by that much it would move with the object
         alike = 0.5  # by which share of that way the palm may miss
-        return way > way_m and float(np.linalg.norm(last.palm_m - to)) < alike * way
+        return way > way_m and float(np.linalg.norm(palm_last - to)) < alike * way
 
 
 FAR_M = 5.0e-3
@@ -111,14 +102,6 @@ _BONES: Int = np.concatenate(
 )
 _SEGMENTS = 15
 _PALM = 0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _PointEstimate:
-    """Pose `T_rig_object` (4, 4) of an object at an epoch, covariance (6, 6)."""
-
-    T: Float
-    cov: Float
 
 
 class ContactMonitor:
@@ -155,7 +138,8 @@ class ContactMonitor:
             self._touching[name] = np.zeros(6, np.bool_)
             self._carried[name].forget()
             return _unknown(pose, name)
-        found, sigma = _gaps(pose, surface, placed)
+        T, cov = placed
+        found, sigma = _gaps(pose, surface, T, cov)
         # Fingers (5, 3) and the palm's four bones as a sixth of its own.
         distance = found.distance_m
         segments = distance[:_SEGMENTS].reshape(5, 3)
@@ -167,14 +151,14 @@ class ContactMonitor:
         last = 3 * np.arange(5) + 2
         centre = np.where(pose.valid[_PALM], pose.position_m[_PALM], np.nan)
         free = _away(distance[bones[:5]], sigma[bones[:5]])
-        carried = self._carried[name].push(pose.t_ns, placed.T, centre, float(distance[palm]), free)
+        carried = self._carried[name].push(pose.t_ns, T, centre, float(distance[palm]), free)
         return Contact(
             hand=pose.hand,
             object=name,
             t_ns=pose.t_ns,
             distance_m=distance[last],
             sigma_m=sigma[last],
-            point_m=transform(placed.T, found.point_m[last]),
+            point_m=transform(T, found.point_m[last]),
             touching=touching[:5],
             palm_distance_m=float(distance[palm]),
             held=carried or bool((touching[0] or touching[5]) and touching[1:5].any()),
@@ -198,9 +182,9 @@ def _touches(distance: Float, sigma: Float, before: Bool) -> Bool:
     return sure & (begins | stay_near)
 
 
-def _gaps(pose: HandPose, surface: Surface, placed: _PointEstimate) -> tuple[Nearest, Float]:
+def _gaps(pose: HandPose, surface: Surface, T_rig_object: Float, cov_object: Float) -> tuple[Nearest, Float]:
     """Return distances of all bones (19,), object frame, and sigmas; NaN: not valid."""
-    points = transform(invert(placed.T), np.nan_to_num(pose.position_m))
+    points = transform(invert(T_rig_object), np.nan_to_num(pose.position_m))
     start, stop = _BONES.T
     capsules = Capsules(points[start], points[stop], pose.radius_m[start], pose.radius_m[stop])
     found = surface.nearest_to_capsules(capsules)
@@ -208,7 +192,7 @@ def _gaps(pose: HandPose, surface: Surface, placed: _PointEstimate) -> tuple[Nea
     middle = capsules.start_m + found.along[:, None] * (capsules.stop_m - capsules.start_m)
     out = middle - found.point_m
     length = np.linalg.norm(out, axis=1)
-    R = placed.T[:3, :3]
+    R = T_rig_object[:3, :3]
     normal = (out / np.maximum(length, 1e-9)[:, None]) @ R.T
     lever = found.point_m @ R.T
     along = found.along[:, None, None]
@@ -216,22 +200,22 @@ def _gaps(pose: HandPose, surface: Surface, placed: _PointEstimate) -> tuple[Nea
     cov = (1.0 - along) * pose.cov_m2[start] + along * pose.cov_m2[stop]
     hand = np.einsum("ni,nij,nj->n", normal, cov, normal)
     pull = np.concatenate([normal, cross(lever, normal)], axis=1)
-    own = np.einsum("ni,ij,nj->n", pull, placed.cov, pull)
+    own = np.einsum("ni,ij,nj->n", pull, cov_object, pull)
     surface_sigma_m = 1.0e-3  # standard deviation of the skin about the profile's radii
     sigma = np.sqrt(hand + own + surface_sigma_m**2)
     nan = np.where(usable, 0.0, np.nan)
     return Nearest(found.distance_m + nan, found.point_m + nan[:, None], found.along), sigma + nan
 
 
-def _at(poses: Sequence[ObjectPose], t_ns: int) -> _PointEstimate | None:
-    """Return the pose of an object at a time, from its last poses; None: not known."""
+def _at(poses: Sequence[ObjectPose], t_ns: int) -> tuple[Float, Float] | None:
+    """Return pose (4, 4) and covariance (6, 6) of an object at a time, or None."""
     led_s = 0.1  # by which an object's pose is led on, at most
     if not poses or t_ns - poses[-1].t_ns > led_s * 1e9 or poses[0].t_ns - t_ns > led_s * 1e9:
         return None
     if len(poses) == 1:
         one = poses[0]
         dt = (t_ns - one.t_ns) * 1e-9
-        return _PointEstimate(_pose_of(one), one.cov + _led(dt))
+        return _pose_of(one), one.cov + _led(dt)
     after = next((k for k, one in enumerate(poses) if one.t_ns >= t_ns), len(poses) - 1)
     a, b = poses[max(after, 1) - 1], poses[max(after, 1)]
     share = (t_ns - a.t_ns) / (b.t_ns - a.t_ns)
@@ -241,7 +225,7 @@ def _at(poses: Sequence[ObjectPose], t_ns: int) -> _PointEstimate | None:
     T = rigid(R, T_a[:3, 3] + share * (T_b[:3, 3] - T_a[:3, 3]))
     near = b if share > 0.5 else a
     beyond_s = max(t_ns - b.t_ns, a.t_ns - t_ns, 0) * 1e-9
-    return _PointEstimate(T, near.cov + _led(beyond_s))
+    return T, near.cov + _led(beyond_s)
 
 
 def _led(dt_s: float) -> Float:

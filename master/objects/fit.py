@@ -25,8 +25,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix, skew
+from master.estimator.sensors import CameraArrays
 from master.fabrik.intersection import RAYS
 
 
@@ -40,6 +40,12 @@ class Views:
     focal: Float  # (n, 2) [px]
     centre: Float  # (n, 2) [px]
     radius_2: Float  # (n,) squares of the radii [m^2], 0: a point
+
+    @classmethod
+    def of(cls, cameras: CameraArrays, camera: Int, radius_m: Float) -> "Views":
+        """Those of observations (n,), of balls of radii (n,) [m]."""
+        R, t, _, focal, centre, lens, _ = (array[camera] for array in cameras)
+        return cls(R, t, lens.T, focal, centre, radius_m * radius_m)
 
     def see(self, points: Float) -> tuple[Float, Float, Float]:
         """Project points (n, 3) [m]; of balls about them the middles of their outlines.
@@ -74,28 +80,6 @@ class Views:
         return uv * self.focal + self.centre, by_own @ self.R, z
 
 
-class Cameras:
-    """The cameras of a rig. Holds no state between calls."""
-
-    def __init__(self, cameras: tuple[CameraModel, ...]) -> None:
-        self._R = np.array([c.T_camera_rig[:3, :3] for c in cameras])
-        self._t = np.array([c.T_camera_rig[:3, 3] for c in cameras])
-        self._lens = np.array([c.distortion for c in cameras]).T
-        self._focal = np.array([c.matrix[[0, 1], [0, 1]] for c in cameras])
-        self._centre = np.array([c.matrix[:2, 2] for c in cameras])
-
-    def of(self, camera: Int, radius_m: Float) -> Views:
-        """Those of observations (n,), of balls of radii (n,) [m]."""
-        return Views(
-            self._R[camera],
-            self._t[camera],
-            self._lens[:, camera],
-            self._focal[camera],
-            self._centre[camera],
-            radius_m * radius_m,
-        )
-
-
 ORDERS = 5
 _FACTORIAL: Float = np.array([1.0, 1.0, 2.0, 6.0, 24.0])
 _POWERS = np.arange(ORDERS)
@@ -118,13 +102,13 @@ class Motion:
         """An object at rest."""
         return cls(T, np.zeros((ORDERS, 2, 3)))
 
-    def at(self, t_s: float, orders: int = 2) -> "Motion":
+    def at(self, t_s: float) -> "Motion":
         """The pose at another time, by the first derivatives; these kept."""
         weights = t_s**_POWERS / _FACTORIAL
-        weights[orders:] = 0.0
+        weights[2:] = 0.0
         way = np.einsum("k,kij->ij", weights, self.rates)
         rates = self.rates.copy()
-        rates[orders:] = 0.0
+        rates[2:] = 0.0
         return Motion(_stepped(self.T, way), rates)
 
     def retracted(self, step: Float) -> "Motion":
@@ -169,24 +153,15 @@ class Observations:
     uv: Float  # (n, 2) [px], distorted image
     sigma_px: Float  # (n,) standard deviation per axis
     t_sigma_s: Float  # (n,) of the times, the same error for all of a camera
-
-    def some(self, associated: Bool) -> "Observations":
-        """Those of a mask (n,)."""
-        return Observations(
-            self.camera[associated],
-            self.point[associated],
-            self.tau_s[associated],
-            self.uv[associated],
-            self.sigma_px[associated],
-            self.t_sigma_s[associated],
-        )
+    feature: Int  # (n,) of what each is a part, which is weighed down as a whole in its camera
+    now: Bool  # (n,) of the nearest frame of its camera
 
 
 class Sums:
     """Weighted sums of observations; holds which belong together, and variances."""
 
-    def __init__(self, seen: Observations, feature: Int, floor_2: Float, points: int) -> None:
-        """Set up; `feature` (n,) of what each is a part, `points` of the object.
+    def __init__(self, seen: Observations, floor_2: Float, points: int) -> None:
+        """Set up for an object of so many points.
 
         `floor_2` (n,): variance per axis [px^2] that light, lens and calibration leave.
         """
@@ -204,7 +179,9 @@ class Sums:
         self._of_group = np.zeros((len(first), len(group)))
         self._of_group[group, np.arange(len(group))] = 1.0
         self._group_size = self._of_group.sum(axis=1)
-        _, self._whole = np.unique(seen.camera * (int(feature.max()) + 1) + feature, return_inverse=True)
+        _, self._whole = np.unique(
+            seen.camera * (int(seen.feature.max()) + 1) + seen.feature, return_inverse=True
+        )
         self._whole_size = np.bincount(self._whole)
         # Of numbers that were measured a bead has two, a tag eight, however often it was.
         self._numbers = 2.0 * np.bincount(self._whole[first])
@@ -279,32 +256,25 @@ class Fitted:
 class PoseFit:
     """Fits poses of one object in one rig. Holds no state between calls."""
 
-    def __init__(
-        self, cameras: tuple[CameraModel, ...], points: Float, radius_m: Float, floor_px: Float
-    ) -> None:
+    def __init__(self, cameras: CameraArrays, points: Float, radius_m: Float, floor_px: Float) -> None:
         """Set up for points (P, 3) [m], object frame, of radii (P,), 0: a corner.
 
         `floor_px` (P,): standard deviation of what light, lens and calibration leave, per point and camera.
         """
-        self._cameras, self._points, self._radius = Cameras(cameras), points, radius_m
+        self._cameras, self._points, self._radius = cameras, points, radius_m
         self._floor_2 = floor_px * floor_px
         self._priors = np.stack([_precision(level) for level in range(len(_SPEED))])
         # Of each degree of vigour the logarithm of its prior's determinant.
         self._log_prior = np.log(np.diagonal(self._priors, axis1=1, axis2=2)).sum(axis=1)
 
-    def __call__(
-        self, seen: Observations, start: Motion, past: Past | None = None, *, feature: Int
-    ) -> Fitted | None:
-        """Fit from a start; None: it leads nowhere (behind a camera, not determined).
-
-        `feature` (n,): of what each observation is a part, which is weighed down as a whole in its camera.
-        """
+    def __call__(self, seen: Observations, start: Motion, past: Past | None = None) -> Fitted | None:
+        """Fit from a start; None: it leads nowhere (behind a camera, not determined)."""
         task = _Task(
             seen,
             self._points[seen.point],
             basis_at(seen.tau_s),
-            self._cameras.of(seen.camera, self._radius[seen.point]),
-            Sums(seen, feature, self._floor_2[seen.point], len(self._points)),
+            Views.of(self._cameras, seen.camera, self._radius[seen.point]),
+            Sums(seen, self._floor_2[seen.point], len(self._points)),
             past,
             self._priors[-1],
         )
@@ -337,7 +307,6 @@ class PoseFit:
         sign, size = np.linalg.slogdet(normal)
         if not (sign > 0).all() or not np.isfinite(x).all():
             return None
-        # evidence
         evidence = 0.5 * (x @ pull - size + self._log_prior)  # twice the logarithm
         share = np.exp(0.5 * (evidence - evidence.max()))
         share /= share.sum()

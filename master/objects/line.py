@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from common.arrays import Float, Int
+from common.arrays import Float
 from common.calibration import RigCalibration
 from common.calibration.object_profile import ObjectProfile
 from common.geometry.camera_model import CameraModel
@@ -37,8 +37,14 @@ from common.messages import MarkerDetections, ObjectPose, ObjectSource, TagDetec
 from master.estimator.sensors import CameraArrays
 from master.fabrik.depth import CalibrationResidual
 from master.fabrik.one_euro import NoiseEstimator, OneEuro, OneEuroParameters
-from master.objects.association import Association, SingleTag, poses_of_beads, poses_of_tags, sighted_now
-from master.objects.fit import Fitted, Motion, Past, PoseFit
+from master.objects.association import (
+    SingleTag,
+    observations_of,
+    poses_of_beads,
+    poses_of_tags,
+    sighted_now,
+)
+from master.objects.fit import Fitted, Motion, Observations, Past, PoseFit
 from master.objects.surface import Features
 from master.objects.window import Hidden, Window, Windows
 
@@ -82,18 +88,12 @@ _SCALE: Float = np.array([1.0] * 3 + [_ARM_M] * 3)
 _SIX, _TWELVE = np.arange(6), np.arange(12)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Known:
-    t_ns: int
-    fitted: Fitted
-
-
 class Trajectory:
     """Push machine: sixteen fitted poses, and when one was last fully constrained."""
 
     def __init__(self) -> None:
         poses = 16
-        self._known: deque[_Known] = deque(maxlen=poses)
+        self._known: deque[tuple[int, Fitted]] = deque(maxlen=poses)
         self._sure_ns = -(2**63)
 
     def __bool__(self) -> bool:
@@ -101,7 +101,7 @@ class Trajectory:
 
     def push(self, t_ns: int, fitted: Fitted) -> bool:
         """Add a pose; False: not fully constrained for too long, all are forgotten."""
-        self._known.append(_Known(t_ns, fitted))
+        self._known.append((t_ns, fitted))
         if fitted.measured_only:
             self._sure_ns = t_ns
         elif self.unsure_s(t_ns) > HELD_S:
@@ -121,37 +121,37 @@ class Trajectory:
         """Where the object is led to; None: it was not seen for long."""
         if not self._known:
             return None
-        last = self._known[-1]
-        dt = (t_ns - last.t_ns) * 1e-9
+        last_ns, last = self._known[-1]
+        dt = (t_ns - last_ns) * 1e-9
         if dt > HELD_S:
             self._known.clear()
             return None
-        return last.fitted.motion.at(_DIES_S * float(1.0 - np.exp(-dt / _DIES_S)))
+        return last.motion.at(_DIES_S * float(1.0 - np.exp(-dt / _DIES_S)))
 
     def past(self, t_ns: int, oldest_ns: int) -> Past:
         """Return the prior at an epoch, from before its oldest observation."""
-        known = next((k for k in reversed(self._known) if k.t_ns <= oldest_ns), self._known[0])
-        dt = max((t_ns - known.t_ns) * 1e-9, 1e-3)
+        known_ns, known = next((k for k in reversed(self._known) if k[0] <= oldest_ns), self._known[0])
+        dt = max((t_ns - known_ns) * 1e-9, 1e-3)
         step = np.eye(12)
         step[_SIX, _SIX + 6] = dt
-        grown = step @ known.fitted.cov @ step.T
+        grown = step @ known.cov @ step.T
         grown[_TWELVE, _TWELVE] += np.concatenate([0.5 * dt * dt * _PUSHED, dt * _PUSHED]) ** 2
-        return Past(known.fitted.motion.at(dt), np.asarray(np.linalg.inv(grown), np.float64))
+        return Past(known.motion.at(dt), np.asarray(np.linalg.inv(grown), np.float64))
 
     def held_cov(self, t_ns: int) -> Float | None:
         """Return the covariance (6, 6) predicted unobserved; None: to be held no more."""
         if not self._known or self.unsure_s(t_ns) > HELD_S:
             return None
-        known = self._known[-1]
-        dt = (t_ns - known.t_ns) * 1e-9
-        cov = known.fitted.cov[:6, :6].copy()
+        known_ns, known = self._known[-1]
+        dt = (t_ns - known_ns) * 1e-9
+        cov = known.cov[:6, :6].copy()
         grown = _PUSHED * 0.5 * dt * dt
-        speed = known.fitted.motion.rates[1].ravel() * (dt - _DIES_S * (1.0 - np.exp(-dt / _DIES_S)))
+        speed = known.motion.rates[1].ravel() * (dt - _DIES_S * (1.0 - np.exp(-dt / _DIES_S)))
         cov[_SIX, _SIX] += grown**2 + speed**2
         return cov
 
 
-def unheeded(fitted: Fitted, measured: Fitted, since_s: float, poor_m: float) -> Fitted:
+def with_unobserved(fitted: Fitted, measured: Fitted, since_s: float, poor_m: float) -> Fitted:
     """Grow a fit's covariance in the directions the observations do not constrain.
 
     By what may have happened there for `since_s`. A turn about the line through two beads shows in nothing
@@ -183,6 +183,12 @@ class SolvedObject:
     ready_t_ns: int
 
 
+def no_pose(name: str, t_ns: int, *, expected: int, occluded: bool) -> ObjectPose:
+    """Return the message that it is not known where an object is."""
+    nowhere = np.full(3, np.nan), np.full(4, np.nan), np.full((6, 6), np.nan), np.nan
+    return ObjectPose(name, t_ns, *nowhere, int(ObjectSource.NONE), False, 0, expected, occluded)
+
+
 class ObjectLine:
     """Push machine: observations of one object to poses, fitted, filtered, led on."""
 
@@ -201,8 +207,8 @@ class ObjectLine:
         self._windows = Windows(models, self._features, predict=rig.frame_sync == "predict", late_ns=late)
         least_px = np.where(self._features.radius_m > 0.0, _BEAD_FLOOR_PX, _CORNER_FLOOR_PX)
         floor_px = np.maximum(CalibrationResidual.of(rig).rays_px, least_px)
-        self._fit = PoseFit(self._cameras, self._features.points, self._features.radius_m, floor_px)
         self._arrays = CameraArrays.of(self._cameras)
+        self._fit = PoseFit(self._arrays, self._features.points, self._features.radius_m, floor_px)
         self._hidden = Hidden(self._features, self._cameras)
         middle = self._features.points.mean(axis=0) if len(self._features.points) else np.zeros(3)
         self._filter = PoseFilter(middle, OneEuroParameters.of(rig.filter))
@@ -234,24 +240,24 @@ class ObjectLine:
     def _solve(self, window: Window) -> ObjectPose:
         predicted = self._trajectory.predicted(window.t_ns)
         seen = self._associated(window, None if predicted is None else predicted.T)
-        max_age_periods = 2.25  # an observation older than this is not now
-        now = (
-            seen is not None
-            and float(np.abs(seen.seen.tau_s).min()) <= max_age_periods * window.period_ns * 1e-9
-        )
+        now_s = 2.25 * window.period_ns * 1e-9  # an observation older than this is not now
         fitted = None
-        if seen is not None and now:
+        if seen is not None and float(np.abs(seen.tau_s).min()) <= now_s:
             fitted = self._found(window, seen, predicted)
         if fitted is None or seen is None:
             return self._held(window, predicted)
         if not self._trajectory.push(window.t_ns, fitted):
             return self._none(window)
         tracked = fitted.measured_only or not fitted.poorer(_TRACKED_M, _TRACKED_RAD)
-        shown = self._hidden.look(window, fitted.motion.T, seen.used(fitted))
-        self._lost_behind = shown.occluded
+        used = np.zeros((len(self._cameras), self._features.count), np.bool_)
+        here = fitted.used & seen.now
+        used[seen.camera[here], seen.feature[here]] = True
+        count, expected, self._lost_behind = self._hidden.look(window, fitted.motion.T, used)
         T = self._filter.push(window.t_ns, fitted.motion.T, fitted.cov[:6, :6])
-        features = self._features.feature[seen.seen.point[fitted.used]]
-        near = fitted.used & (np.abs(seen.seen.tau_s) <= max_age_periods * window.period_ns * 1e-9)
+        # What rests on both is called of markers.
+        beads = (self._features.feature[seen.point[fitted.used]] < self._features.beads).any()
+        source = ObjectSource.MARKERS if beads else ObjectSource.TAGS
+        near = fitted.used & (np.abs(seen.tau_s) <= now_s)
         return ObjectPose(
             object=self.name,
             t_ns=window.t_ns,
@@ -259,73 +265,68 @@ class ObjectLine:
             orientation_wxyz=matrix_to_quaternion(T[:3, :3]),
             cov=fitted.cov[:6, :6],
             residual_m=float(np.sqrt((fitted.residual_m[near] ** 2).mean())) if near.any() else np.nan,
-            source=int(self._source(features) if tracked else ObjectSource.HELD),
+            source=int(source if tracked else ObjectSource.HELD),
             tracked=tracked,
-            seen=shown.seen,
-            expected=shown.expected,
-            occluded=shown.occluded,
+            seen=count,
+            expected=expected,
+            occluded=self._lost_behind,
         )
 
-    def _source(self, features: Int) -> ObjectSource:
-        """What a pose that rests on these features comes from; both are called markers."""
-        return ObjectSource.MARKERS if (features < self._features.beads).any() else ObjectSource.TAGS
-
-    def _found(self, window: Window, seen: Association, predicted: Motion | None) -> Fitted | None:
+    def _found(self, window: Window, seen: Observations, predicted: Motion | None) -> Fitted | None:
         """Return the pose; None: it is not the object, or not constrained."""
         if predicted is not None:
             led = self._fitted(seen, predicted, window.t_ns, led=True)
-            if led is not None and self._holds(seen, led):
+            if led is not None and self._holds(led):
                 return self._single_tag.of_two(window, seen, led, begins=False)
-        best: tuple[Fitted, Association] | None = None
+        good: list[tuple[Fitted, Observations]] = []
         for T in self._starts(window):
             again = self._associated(window, T)
-            if (
-                again is None
-                or (fitted := self._fitted(again, Motion.still(T), window.t_ns, led=False)) is None
-            ):
-                continue
-            good = self._holds(again, fitted) and self._begins(again, fitted)
-            if good and (best is None or fitted.cost < best[0].cost):
-                best = fitted, again
-        if best is None:
+            fitted = None if again is None else self._fitted(again, Motion.still(T), window.t_ns, led=False)
+            if again is not None and fitted is not None and self._begins(again, fitted):
+                good.append((fitted, again))
+        if not good:
             return None
         # What was known of where it went is of another thing.
         self._trajectory.clear()
         self._single_tag.forget()
-        return self._single_tag.of_two(window, best[1], best[0], begins=True)
+        fitted, again = min(good, key=lambda one: one[0].cost)
+        return self._single_tag.of_two(window, again, fitted, begins=True)
 
-    def _associated(self, window: Window, T: Float | None) -> Association | None:
+    def _associated(self, window: Window, T: Float | None) -> Observations | None:
         """What is seen of the object, near a pose (4, 4) if there is one."""
-        return Association.of(window, self._features, self._cameras, T, self._hidden.centroid_sigma_px)
+        return observations_of(window, self._features, self._cameras, T, self._hidden.centroid_sigma_px)
 
-    def _fitted(self, seen: Association, start: Motion, t_ns: int, *, led: bool) -> Fitted | None:
+    def _fitted(self, seen: Observations, start: Motion, t_ns: int, *, led: bool) -> Fitted | None:
         """Fit the pose, with the past as prior where the present is too weak.
 
         Only of a pose that was predicted (`led`). How it may have moved since is then in it.
         """
-        measured = self._fit(seen.seen, start, feature=seen.feature)
+        measured = self._fit(seen, start)
         if measured is not None and not measured.poorer(_POOR_M, _POOR_RAD):
             return measured
         both = None
         if led:
-            oldest_ns = t_ns + round(float(seen.seen.tau_s.min()) * 1e9)
-            past = self._trajectory.past(t_ns, oldest_ns)
-            both = self._fit(seen.seen, start, past, feature=seen.feature)
+            oldest_ns = t_ns + round(float(seen.tau_s.min()) * 1e9)
+            both = self._fit(seen, start, self._trajectory.past(t_ns, oldest_ns))
         if measured is None:
             return None if both is None else replace(both, measured_only=False)
         if both is None or not measured.poorer(_INCOMPLETE_M, _INCOMPLETE_RAD):
             return measured if both is None else both
-        return unheeded(both, measured, self._trajectory.unsure_s(t_ns), _POOR_M)
+        return with_unobserved(both, measured, self._trajectory.unsure_s(t_ns), _POOR_M)
 
-    def _holds(self, seen: Association, fitted: Fitted) -> bool:
+    def _holds(self, fitted: Fitted) -> bool:
         """Whether a pose is determined, and most of what is seen now is in its place."""
-        if fitted.poorer(_LOST_M, _LOST_RAD):
-            return False
         most = 0.5  # share of what is seen that must be in its place
-        return float(fitted.weight.mean()) >= most and len(np.unique(seen.feature[fitted.used])) >= 1
+        return (
+            not fitted.poorer(_LOST_M, _LOST_RAD)
+            and float(fitted.weight.mean()) >= most
+            and bool(fitted.used.any())
+        )
 
-    def _begins(self, seen: Association, fitted: Fitted) -> bool:
-        """Whether a pose may begin with no past: three beads, or a tag, that fit."""
+    def _begins(self, seen: Observations, fitted: Fitted) -> bool:
+        """Whether a pose may begin: it holds, and three beads, or a tag, fit."""
+        if not self._holds(fitted):
+            return False
         features = np.unique(seen.feature[fitted.used])
         enough = len(features) >= 3 or bool((features >= self._features.beads).any())
         start_chi2 = 25.0  # chi square per number of what a pose from nothing rests on
@@ -344,13 +345,10 @@ class ObjectLine:
         cov = self._trajectory.held_cov(window.t_ns)
         if predicted is None or cov is None:
             return self._none(window)
-        shown = self._hidden.look(
-            window, predicted.T, np.zeros((len(self._cameras), self._features.count), np.bool_)
-        )
-        self._lost_behind = shown.occluded
-        T, source = predicted.T, int(ObjectSource.HELD)
+        T, nothing = predicted.T, np.zeros((len(self._cameras), self._features.count), np.bool_)
+        _, expected, self._lost_behind = self._hidden.look(window, T, nothing)
         pose = self.name, window.t_ns, T[:3, 3], matrix_to_quaternion(T[:3, :3]), cov
-        return ObjectPose(*pose, np.nan, source, False, 0, shown.expected, shown.occluded)
+        return ObjectPose(*pose, np.nan, int(ObjectSource.HELD), False, 0, expected, self._lost_behind)
 
     def _glimpsed(self, window: Window) -> bool:
         """Whether a camera sees some of the beads and not all, while there is no pose."""
@@ -362,6 +360,5 @@ class ObjectLine:
     def _none(self, window: Window) -> ObjectPose:
         """No pose; what hid it when it was lost is taken to hide it still."""
         self._filter.forget()
-        nowhere = np.full(3, np.nan), np.full(4, np.nan), np.full((6, 6), np.nan), np.nan
-        source, occluded = int(ObjectSource.NONE), self._lost_behind or self._glimpsed(window)
-        return ObjectPose(self.name, window.t_ns, *nowhere, source, False, 0, 0, occluded)
+        occluded = self._lost_behind or self._glimpsed(window)
+        return no_pose(self.name, window.t_ns, expected=0, occluded=occluded)

@@ -17,9 +17,9 @@ these are missing is no evidence.
 hundreds of points at once, and most of what that costs is the number of calls.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 
@@ -42,96 +42,6 @@ _GRAZES_M = 1e-3  # a sight that goes no deeper is not hidden: a tag lies on the
 _TINY = 1e-12
 
 
-class Boxes:
-    """Boxes, by the halves of their sides (K, 3)."""
-
-    def __init__(self, shapes: Sequence[BoxShape]) -> None:
-        self._half = 0.5 * np.array([shape.size_m for shape in shapes])
-
-    def distances(self, own: Float) -> Float:
-        """(K, N) [m], negative inside, of points (K, 3, N) in the frame of each part."""
-        deep = np.abs(own) - self._half[:, :, None]
-        off = np.maximum(deep, 0.0)
-        return np.sqrt((off * off).sum(axis=1)) + np.minimum(deep.max(axis=1), 0.0)
-
-    def feet(self, part: Int, own: Float) -> Float:
-        """Return nearest surface points (N, 3) of parts (N,) to points, part frames."""
-        return _feet_of_box(self._half[part], own)
-
-    def through(self, start: Float, way: Float) -> tuple[Float, Float]:
-        """Return from where to where rays are inside a part, a little below its skin.
-
-        Ways (K, 3, N) from starts (K, 3). Both (K, N) are shares of the way; where the second is not above
-        the first, the sight passes by.
-        """
-        return _through_slabs(self._half - _GRAZES_M, start, way)
-
-
-class Cylinders:
-    """Closed cylinders along z, by radius and half their length."""
-
-    def __init__(self, shapes: Sequence[CylinderShape]) -> None:
-        self._size = np.array([[shape.radius_m, 0.5 * shape.length_m] for shape in shapes])
-
-    def distances(self, own: Float) -> Float:
-        """As of `Parts`: in the plane of axis and point a cylinder is a box."""
-        x, y, z = own.swapaxes(0, 1)
-        out = np.sqrt(x * x + y * y) - self._size[:, :1]
-        up = np.abs(z) - self._size[:, 1:]
-        side, end = np.maximum(out, 0.0), np.maximum(up, 0.0)
-        return np.sqrt(side * side + end * end) + np.minimum(np.maximum(out, up), 0.0)
-
-    def feet(self, part: Int, own: Float) -> Float:
-        """As of `Boxes`."""
-        out = np.sqrt(np.vecdot(own[:, :2], own[:, :2]))
-        foot = _feet_of_box(self._size[part], np.stack([out, own[:, 2]], axis=1))
-        return np.concatenate([foot[:, :1] * _unit(own[:, :2], out), foot[:, 1:]], axis=1)
-
-    def through(self, start: Float, way: Float) -> tuple[Float, Float]:
-        """As of `Boxes`."""
-        side = _through_round(self._size[:, 0] - _GRAZES_M, start[:, :2], way[:, :2])
-        ends = _through_slabs(self._size[:, 1:] - _GRAZES_M, start[:, 2:], way[:, 2:])
-        return np.maximum(side[0], ends[0]), np.minimum(side[1], ends[1])
-
-
-class Balls:
-    """Balls, by their radii (K,)."""
-
-    def __init__(self, shapes: Sequence[SphereShape]) -> None:
-        self._radius = np.array([shape.radius_m for shape in shapes])
-
-    def distances(self, own: Float) -> Float:
-        """As of `Boxes`."""
-        return np.sqrt((own * own).sum(axis=1)) - self._radius[:, None]
-
-    def feet(self, part: Int, own: Float) -> Float:
-        """As of `Boxes`."""
-        return self._radius[part, None] * _unit(own, np.sqrt(np.vecdot(own, own)))
-
-    def through(self, start: Float, way: Float) -> tuple[Float, Float]:
-        """As of `Boxes`."""
-        return _through_round(self._radius - _GRAZES_M, start, way)
-
-
-# K parts of one kind; they hold no state
-Parts: TypeAlias = Boxes | Cylinders | Balls
-
-
-def by_kind(shapes: Sequence[Shape]) -> list[tuple[list[Shape], Parts]]:
-    """The parts of each kind that there is."""
-    boxes = [shape for shape in shapes if isinstance(shape, BoxShape)]
-    bars = [shape for shape in shapes if isinstance(shape, CylinderShape)]
-    balls = [shape for shape in shapes if isinstance(shape, SphereShape)]
-    kinds: list[tuple[list[Shape], Parts]] = []
-    if bars:
-        kinds.append(([*bars], Cylinders(bars)))
-    if boxes:
-        kinds.append(([*boxes], Boxes(boxes)))
-    if balls:
-        kinds.append(([*balls], Balls(balls)))
-    return kinds
-
-
 def _feet_of_box(half: Float, points: Float) -> Float:
     """Return nearest points (N, D) on boxes of these halves of their sides (N, D)."""
     foot = np.minimum(np.maximum(points, -half), half)
@@ -145,14 +55,14 @@ def _feet_of_box(half: Float, points: Float) -> Float:
 
 
 def _through_slabs(half: Float, start: Float, way: Float) -> tuple[Float, Float]:
-    """Intersect rays, as `Parts.through`, with slabs between planes at +- `half`."""
+    """Intersect rays, as `Parts._through`, with slabs between planes at +- `half`."""
     by = np.where(np.abs(way) > _TINY, way, _TINY)
     one, other = (-half - start)[:, :, None] / by, (half - start)[:, :, None] / by
     return np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
 
 
 def _through_round(radius: Float, start: Float, way: Float) -> tuple[Float, Float]:
-    """As of `Parts.through`, within circles or balls (K,) about the origin."""
+    """As of `Parts._through`, within circles or balls (K,) about the origin."""
     a, b = np.maximum((way * way).sum(axis=1), 1e-18), (way * start[:, :, None]).sum(axis=1)
     inside = b * b - a * (np.vecdot(start, start) - radius * radius)[:, None]
     root = np.sqrt(np.maximum(inside, 0.0))
@@ -180,31 +90,107 @@ class Nearest:
     along: Float  # (N,) where on the bone the nearest ball is, 0..1
 
 
-class _PosedSurface:
-    """All parts of one kind, each where it is on the object."""
+class Parts(ABC):
+    """K parts of one kind, each where it is on the object; they hold no state."""
 
-    def __init__(self, shapes: Sequence[Shape], parts: Parts) -> None:
+    def __init__(self, shapes: Sequence[Shape]) -> None:
         T = [np.eye(4) if s.T_object_part is None else np.array(s.T_object_part, np.float64) for s in shapes]
         T_part_object = np.array([invert(one) for one in T])
         self._R, self._t = T_part_object[:, :3, :3], T_part_object[:, :3, 3]
-        self.parts = parts
 
-    def own(self, points: Float) -> Float:
-        """Points (N, 3), object frame, in the frame of each part (K, 3, N)."""
-        return self._R @ points.T + self._t[:, :, None]
+    def distances(self, points: Float) -> Float:
+        """Return distances (K, N) [m], negative inside, of points (N, 3), object frame."""
+        return self._distances(self._R @ points.T + self._t[:, :, None])
 
     def feet(self, part: Int, points: Float) -> Float:
         """Return nearest surface points (N, 3) of parts (N,) to points, object frame."""
         R, t = self._R[part], self._t[part]
-        foot = self.parts.feet(part, (R @ points[..., None])[..., 0] + t)
+        foot = self._feet(part, (R @ points[..., None])[..., 0] + t)
         return ((foot - t)[:, None] @ R)[:, 0]
 
     def hides(self, eye: Float, points: Float) -> Bool:
         """(N,) whether a part is between an eye (3,) and points (N, 3), object frame."""
-        start = self._R @ eye + self._t
-        enters, leaves = self.parts.through(start, self._R @ (points - eye).T)
+        enters, leaves = self._through(self._R @ eye + self._t, self._R @ (points - eye).T)
         hidden: Bool = np.maximum(enters, 0.0) < np.minimum(leaves, 1.0)
         return np.asarray(hidden.any(axis=0), np.bool_)
+
+    @abstractmethod
+    def _distances(self, own: Float) -> Float:
+        """Distances (K, N) of points (K, 3, N), each part's frame."""
+
+    @abstractmethod
+    def _feet(self, part: Int, own: Float) -> Float:
+        """Nearest surface points (N, 3) of parts (N,) to points (N, 3), part frames."""
+
+    @abstractmethod
+    def _through(self, start: Float, way: Float) -> tuple[Float, Float]:
+        """From where to where rays are inside a part, a little below its skin.
+
+        Ways (K, 3, N) from starts (K, 3). Both (K, N) are shares of the way; where the second is not above
+        the first, the sight passes by.
+        """
+
+
+class Boxes(Parts):
+    """Boxes, by the halves of their sides (K, 3)."""
+
+    def __init__(self, shapes: Sequence[BoxShape]) -> None:
+        super().__init__(shapes)
+        self._half = 0.5 * np.array([shape.size_m for shape in shapes])
+
+    def _distances(self, own: Float) -> Float:
+        deep = np.abs(own) - self._half[:, :, None]
+        off = np.maximum(deep, 0.0)
+        return np.sqrt((off * off).sum(axis=1)) + np.minimum(deep.max(axis=1), 0.0)
+
+    def _feet(self, part: Int, own: Float) -> Float:
+        return _feet_of_box(self._half[part], own)
+
+    def _through(self, start: Float, way: Float) -> tuple[Float, Float]:
+        return _through_slabs(self._half - _GRAZES_M, start, way)
+
+
+class Cylinders(Parts):
+    """Closed cylinders along z, by radius and half their length."""
+
+    def __init__(self, shapes: Sequence[CylinderShape]) -> None:
+        super().__init__(shapes)
+        self._size = np.array([[shape.radius_m, 0.5 * shape.length_m] for shape in shapes])
+
+    def _distances(self, own: Float) -> Float:
+        """In the plane of axis and point a cylinder is a box."""
+        x, y, z = own.swapaxes(0, 1)
+        out = np.sqrt(x * x + y * y) - self._size[:, :1]
+        up = np.abs(z) - self._size[:, 1:]
+        side, end = np.maximum(out, 0.0), np.maximum(up, 0.0)
+        return np.sqrt(side * side + end * end) + np.minimum(np.maximum(out, up), 0.0)
+
+    def _feet(self, part: Int, own: Float) -> Float:
+        out = np.sqrt(np.vecdot(own[:, :2], own[:, :2]))
+        foot = _feet_of_box(self._size[part], np.stack([out, own[:, 2]], axis=1))
+        return np.concatenate([foot[:, :1] * _unit(own[:, :2], out), foot[:, 1:]], axis=1)
+
+    def _through(self, start: Float, way: Float) -> tuple[Float, Float]:
+        side = _through_round(self._size[:, 0] - _GRAZES_M, start[:, :2], way[:, :2])
+        ends = _through_slabs(self._size[:, 1:] - _GRAZES_M, start[:, 2:], way[:, 2:])
+        return np.maximum(side[0], ends[0]), np.minimum(side[1], ends[1])
+
+
+class Balls(Parts):
+    """Balls, by their radii (K,)."""
+
+    def __init__(self, shapes: Sequence[SphereShape]) -> None:
+        super().__init__(shapes)
+        self._radius = np.array([shape.radius_m for shape in shapes])
+
+    def _distances(self, own: Float) -> Float:
+        return np.sqrt((own * own).sum(axis=1)) - self._radius[:, None]
+
+    def _feet(self, part: Int, own: Float) -> Float:
+        return self._radius[part, None] * _unit(own, np.sqrt(np.vecdot(own, own)))
+
+    def _through(self, start: Float, way: Float) -> tuple[Float, Float]:
+        return _through_round(self._radius - _GRAZES_M, start, way)
 
 
 class Surface:
@@ -212,7 +198,14 @@ class Surface:
 
     def __init__(self, parts: Sequence[Shape]) -> None:
         """Take the parts of its shape; none: it has no surface."""
-        self._kinds = [_PosedSurface(shapes, kind) for shapes, kind in by_kind(parts)]
+        bars = [part for part in parts if isinstance(part, CylinderShape)]
+        boxes = [part for part in parts if isinstance(part, BoxShape)]
+        balls = [part for part in parts if isinstance(part, SphereShape)]
+        self._kinds: list[Parts] = [
+            *([Cylinders(bars)] if bars else []),
+            *([Boxes(boxes)] if boxes else []),
+            *([Balls(balls)] if balls else []),
+        ]
 
     def __bool__(self) -> bool:
         return bool(self._kinds)
@@ -221,7 +214,7 @@ class Surface:
         """Return distances (N,) [m], negative inside, and nearest surface points (N, 3)."""
         best, at = np.full(len(points), np.inf), np.full((len(points), 3), np.nan)
         for kind in self._kinds:
-            each = kind.parts.distances(kind.own(points))
+            each = kind.distances(points)
             part: Int = each.argmin(axis=0)
             distance = each[part, np.arange(len(points))]
             nearer: Int = np.flatnonzero(distance < best)
@@ -234,7 +227,7 @@ class Surface:
         """Distances (N,) [m] alone."""
         best = np.full(len(points), np.inf)
         for kind in self._kinds:
-            best = np.minimum(best, kind.parts.distances(kind.own(points)).min(axis=0))
+            best = np.minimum(best, kind.distances(points).min(axis=0))
         return best
 
     def nearest_to_capsules(self, capsules: Capsules) -> Nearest:
@@ -341,6 +334,10 @@ class Features:
     def corners_of(self, tag: int) -> Int:
         """Rows (4,) of `points` of the tag in that place of `tag_ids`."""
         return self.beads + 4 * tag + np.arange(4)
+
+    def corners_m(self, feature: int) -> Float:
+        """Corners (4, 3) [m], object frame, of a feature that is a tag."""
+        return self.points[self.corners_of(feature - self.beads)]
 
     def expected(self, T_rig_object: Float, camera: CameraModel, ease: float = 1.0) -> Bool:
         """Return (F,) which features a camera sees of the object at a pose (4, 4).

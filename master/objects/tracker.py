@@ -21,13 +21,12 @@ from common.arrays import Float
 from common.calibration import RigCalibration
 from common.calibration.object_profile import ObjectProfile
 from common.errors import CalibrationError
-from common.geometry.transforms import invert, matrix_to_quaternion, quaternion_to_matrix
+from common.geometry.transforms import invert, matrix_to_quaternion, quaternion_to_matrix, rigid
 from common.messages import ObjectPose, ObjectSource, TrackerPose
-from master.objects.line import HELD_S, SolvedObject
+from master.objects.line import HELD_S, SolvedObject, no_pose
 
 # of a registration without figures, such as one made by hand
 _UNKNOWN_M, _UNKNOWN_RAD = 5e-3, np.radians(1.5)
-_NOWHERE = (np.full(3, np.nan), np.full(4, np.nan), np.full((6, 6), np.nan))
 
 
 def registered(profile: ObjectProfile, rig: RigCalibration) -> bool:
@@ -84,10 +83,6 @@ class TrackerLine:
         pose = self._measured(t_ns, message)
         return [SolvedObject(self._held(t_ns) if pose is None else pose, message.t_ns)]
 
-    def flush(self) -> list[SolvedObject]:
-        """At the end of a recording: nothing waits."""
-        return []
-
     def _measured(self, t_ns: int, message: TrackerPose) -> ObjectPose | None:
         """Return the object's pose; None: tracking is lost, or the report impossible."""
         place, quaternion = message.position_m, message.orientation_wxyz
@@ -98,13 +93,11 @@ class TrackerLine:
         if abs(float(np.linalg.norm(quaternion)) - 1.0) > unit_within:
             self.counts["broken"] += 1
             return None
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = quaternion_to_matrix(quaternion), place
-        T = self._T_rig_tracking @ T @ self._T_device_object
+        T = self._T_rig_tracking @ rigid(quaternion_to_matrix(quaternion), place) @ self._T_device_object
         if self._leaps(t_ns, T[:3, 3]):
             self.counts["leap"] += 1
             return None
-        pose = ObjectPose(
+        self._last = ObjectPose(
             object=self.name,
             t_ns=t_ns,
             position_m=T[:3, 3],
@@ -117,21 +110,20 @@ class TrackerLine:
             expected=1,
             occluded=False,
         )
-        self._last = pose
-        return pose
+        return self._last
 
     def _leaps(self, t_ns: int, place_m: Float) -> bool:
         """Check for a leap that no hand could make; after a while it is accepted."""
         if self._last is None:
             return False
-        way = _distance(place_m, self._last.position_m)
+        way = float(np.linalg.norm(place_m - self._last.position_m))
         since_s = max(1e-9 * (t_ns - self._last.t_ns), 1e-3)
         # a leap: farther and faster than that; and how long it is doubted
         leap_m, leap_m_s, leap_s = 0.08, 8.0, 0.15
         if self._leapt is not None:
             leapt_ns, where = self._leapt
             recent = 0 <= t_ns - leapt_ns < round(1e9 * leap_s)
-            if recent and way > leap_m and _distance(place_m, where) < way:
+            if recent and way > leap_m and np.linalg.norm(place_m - where) < way:
                 return True
             self._leapt = None
             if not recent:
@@ -144,13 +136,9 @@ class TrackerLine:
     def _held(self, t_ns: int) -> ObjectPose:
         """Where it was, for a while; then nowhere."""
         last = self._last
-        since_s = 0.0 if last is None else 1e-9 * (t_ns - last.t_ns)
+        since_s = np.inf if last is None else 1e-9 * (t_ns - last.t_ns)
         if last is None or not 0.0 <= since_s <= HELD_S:
-            place, quaternion, cov = _NOWHERE
-            source = ObjectSource.NONE
-            return ObjectPose(
-                self.name, t_ns, place, quaternion, cov, float("nan"), source, False, 0, 1, True
-            )
+            return no_pose(self.name, t_ns, expected=1, occluded=True)
         wanders_m_s, wanders_rad_s = 0.3, 2.0  # what a held pose may have become wrong by
         spread = np.repeat([wanders_m_s * since_s, wanders_rad_s * since_s], 3) ** 2
         return replace(
@@ -162,10 +150,6 @@ class TrackerLine:
             seen=0,
             occluded=True,
         )
-
-
-def _distance(one_m: Float, other_m: Float) -> float:
-    return float(np.linalg.norm(one_m - other_m))
 
 
 def covariance_of(profile: ObjectProfile) -> Float:

@@ -84,7 +84,10 @@ class Windows:
         self._names, self._cameras = tuple(cameras), tuple(cameras.values())
         self._features, self._predict, self._late_ns = features, predict, dict(late_ns or {})
         self._shift = [LensShift((camera,)) for camera in self._cameras]
-        self._seen = [(_line(), _line()) for _ in self._names]
+        kept = SETTINGS.history
+        self._seen = [
+            (deque[ImageObservation](maxlen=kept), deque[ImageObservation](maxlen=kept)) for _ in self._names
+        ]
         self._frames: list[deque[int]] = [deque(maxlen=2) for _ in self._names]  # centres, of markers
         self._newest_of = [-(2**63)] * len(self._names)
         self._period_ns = [_PERIOD_NS] * len(self._names)
@@ -223,10 +226,6 @@ class Windows:
         return Window(t_ns, self._origin_ns, views, max(ready, default=t_ns), period_ns)
 
 
-def _line() -> deque[ImageObservation]:
-    return deque(maxlen=SETTINGS.history)
-
-
 def _around(line: deque[ImageObservation], t_ns: int, reach_ns: int) -> tuple[ImageObservation, ...]:
     """Return up to four observations around an epoch, the nearest first.
 
@@ -239,15 +238,6 @@ def _around(line: deque[ImageObservation], t_ns: int, reach_ns: int) -> tuple[Im
     return tuple(sorted(near, key=lambda s: abs(s.centre_ns - t_ns))[: SETTINGS.observations])
 
 
-@dataclass(frozen=True, slots=True)
-class Seen:
-    """Count of seen and of expected features, and whether a part is hidden."""
-
-    seen: int
-    expected: int
-    occluded: bool
-
-
 class Hidden:
     """Push machine: occluded features; holds how much of a whole bead cameras see."""
 
@@ -255,8 +245,11 @@ class Hidden:
         self._features, self._cameras = features, cameras
         self._whole = np.full((len(cameras), features.beads), np.nan)
 
-    def look(self, window: Window, T_rig_object: Float, used: Bool) -> Seen:
-        """Judge the occlusion of a pose; `used` (C, F): what it rests on, nearest frames."""
+    def look(self, window: Window, T_rig_object: Float, used: Bool) -> tuple[int, int, bool]:
+        """Return how many features are seen and expected, and if a part is hidden.
+
+        At a pose; `used` (C, F): what it rests on, nearest frames.
+        """
         beads = self._features.beads
         expected, occluded = np.zeros(used.shape, np.bool_), False
         for c, camera in enumerate(self._cameras):
@@ -270,7 +263,7 @@ class Hidden:
             occluded |= bool((should & ~used[c]).any())
             if markers is not None and beads:
                 occluded |= self._partly(c, T_rig_object, markers, should[:beads] & used[c, :beads])
-        return Seen(int(used.any(axis=0).sum()), int((expected | used).any(axis=0).sum()), occluded)
+        return int(used.any(axis=0).sum()), int((expected | used).any(axis=0).sum()), occluded
 
     def centroid_sigma_px(self, c: int, T_rig_object: Float, area_px2: Float) -> Float:
         """Return the centroid error [px] of beads (..., B) in camera `c` by occlusion.

@@ -8,7 +8,7 @@ being a master itself, they go on the bus as they came.
 import logging
 import threading
 from collections.abc import Callable, Iterable
-from typing import Generic, Protocol, TypeAlias, TypeVar
+from typing import Protocol, TypeAlias, TypeVar
 
 from common.bus.bus import Bus
 from common.clock import now_ns
@@ -61,19 +61,16 @@ ReceivedT = TypeVar("ReceivedT")
 Receive: TypeAlias = Callable[[float], ReceivedT | None]
 
 
-class DevicePoses(Generic[ReceivedT]):
-    """Message source that publishes tracker poses on the caller's bus as they pass."""
+def publishing_devices(receive: Receive[ReceivedT], bus: Bus) -> Receive[ReceivedT]:
+    """The source `receive`, which publishes tracker poses on the bus as they pass."""
 
-    def __init__(self, receive: Receive[ReceivedT], bus: Bus) -> None:
-        """Stand between a source and who reads it."""
-        self._receive, self._bus = receive, bus
-
-    def get(self, timeout_s: float) -> ReceivedT | None:
-        """The next message; one of a tracker is on the bus, too, stream `device`."""
-        message = self._receive(timeout_s)
+    def get(timeout_s: float) -> ReceivedT | None:
+        message = receive(timeout_s)
         if isinstance(message, TrackerPose):
-            self._bus.publish("device", message.source, message)
+            bus.publish("device", message.source, message)
         return message
+
+    return get
 
 
 TIMEOUT_S = 0.9

@@ -13,11 +13,13 @@ hand is drawn as spheres swept along bones and palm into a depth buffer, orthogr
 from dataclasses import dataclass
 from enum import Enum
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from common.arrays import Float
 from common.calibration import RigCalibration
@@ -282,15 +284,18 @@ def unit(rgb: Rgb) -> Colour:
     return (rgb[0] / 255, rgb[1] / 255, rgb[2] / 255)
 
 
+def entry(colour: Colour, label: str, ls: str = "", **how: Any) -> Line2D:
+    """An entry of a legend: a marker, or a line of the style `ls`."""
+    return Line2D([], [], color=colour, ls=ls, label=label, **how)
+
+
 def style(axes: Axes, title: str) -> None:
     """Dark panel with a title; all panels look alike."""
     axes.set_facecolor(_PANEL)
     axes.set_title(title, color=INK, size=12, loc="left", pad=6)
     axes.tick_params(colors=INK, labelsize=10, length=3)
     axes.grid(visible=True, color=INK, alpha=0.10, lw=0.8)
-    for spine in axes.spines.values():
-        spine.set_color(INK)
-        spine.set_alpha(0.25)
+    axes.spines[:].set(color=INK, alpha=0.25)
 
 
 def draw_panels(figure: Figure, poses: Poses, row: int, model: HandModel, truth: PosesTruth | None) -> None:
@@ -346,11 +351,8 @@ def _seen(axes: Axes, poses: Poses, seconds: Float) -> None:
     style(axes, "What was seen")
     name, points = ("markers", poses.markers_raw_m) if poses.marker_count else ("laser points", poses.laser_m)
     seen = (~np.isnan(points).any(axis=-1)).sum(axis=1)
-    axes.plot(seconds, seen, color=unit(series_rgb(0)), lw=1.3, drawstyle="steps-mid", label=name)
-    tracked = poses.tracked.sum(axis=1)
-    axes.plot(
-        seconds, tracked, color=unit(series_rgb(2)), lw=1.3, drawstyle="steps-mid", label="joints tracked"
-    )
+    for colour, label, count in ((0, name, seen), (2, "joints tracked", poses.tracked.sum(axis=1))):
+        axes.plot(seconds, count, color=unit(series_rgb(colour)), lw=1.3, drawstyle="steps-mid", label=label)
     axes.set_ylim(0.0, 27.0)
     _legend_above(axes)
 
@@ -380,7 +382,5 @@ def _histogram(axes: Axes, values: Float, title: str, what: str) -> None:
 
 
 def _legend_above(axes: Axes) -> None:
-    legend = axes.legend(loc="lower right", bbox_to_anchor=(1.01, 0.98), ncols=5, frameon=False, fontsize=9.5,
-                         handlelength=1.2, columnspacing=1.0, borderpad=0.2)  # fmt: skip
-    for text in legend.get_texts():
-        text.set_color(INK)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.01, 0.98), ncols=5, frameon=False, fontsize=9.5,
+                handlelength=1.2, columnspacing=1.0, borderpad=0.2, labelcolor=INK)  # fmt: skip

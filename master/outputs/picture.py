@@ -19,7 +19,6 @@ from matplotlib.lines import Line2D
 from common.arrays import Float
 from common.calibration import RigCalibration
 from common.calibration.files import replacing
-from common.errors import RecordingError
 from common.geometry.transforms import axis_rotation
 from common.hand.model import FINGER_JOINTS, TIPS, WRIST, HandModel
 from common.messages import Source
@@ -34,6 +33,7 @@ from master.outputs.drawing import (
     Rgb,
     View,
     draw_panels,
+    entry,
     render_hand,
     series_rgb,
     style,
@@ -41,6 +41,7 @@ from master.outputs.drawing import (
 )
 from master.outputs.picture_overlays import ResultPicture, WristPicture
 from master.outputs.poses import Poses, PosesTruth
+from master.outputs.result_files import cannot_write
 from master.rig.merge import edges
 
 STRIPS = (*((WRIST, *joints) for joints in FINGER_JOINTS), (7, 12, 17, 22))
@@ -155,7 +156,12 @@ def draw_summary(
         else:
             wrist.draw_camera(figure, poses, row, truth)
         draw_panels(figure, poses, row, model, truth)
-    _save(figure, path)
+    try:
+        with replacing(path) as file:
+            # No creation date or version inside: the same run gives the same picture.
+            figure.savefig(file, format="png", dpi=_DPI, facecolor=PAPER, metadata={"Software": None})
+    except OSError as error:
+        raise cannot_write(path, error) from error
 
 
 def best_row(poses: Poses, results: ResultPicture | None = None) -> int | None:
@@ -184,9 +190,8 @@ def _header(
 ) -> None:
     figure.text(0.018, 0.948, "Phalanx", color=INK, size=25, weight="bold", va="center")
     most_figures = 10
-    shown = [(label, form.format(summary[key])) for key, label, form in _FIGURES if key in summary][
-        :most_figures
-    ]
+    shown = [(label, form.format(summary[key])) for key, label, form in _FIGURES if key in summary]
+    shown = shown[:most_figures]
     many = len(shown) > 8
     wrist_rigs = [wrist.rig] if wrist is not None and wrist.in_rig else []
     count = len(rig.cameras) + len(wrist_rigs)
@@ -244,7 +249,8 @@ def _hand(
     )
     if truth is not None:
         _bones(axes, view.project(truth.joints_m[row]), [TRUTH_RGB] * 26, width=1.3, dashes=(3, 2))
-    colours = [_source_rgb(code) for code in poses.source[row].tolist()]
+    rgb = {source.value: SOURCE_RGB[source] for source in Source}
+    colours = [rgb.get(code, SOURCE_RGB[Source.NONE]) for code in poses.source[row].tolist()]
     pixels = view.project(at)
     _bones(axes, pixels, colours, width=3.4)
     for joint in np.flatnonzero(poses.valid[row]).tolist():
@@ -299,34 +305,18 @@ def _legend(figure: Figure, poses: Poses, truth: PosesTruth | None, more: list[L
         Line2D([], [], color=unit(SOURCE_RGB[s]), marker="o", mfc=PAPER, mew=2, lw=3, label=SOURCE_MEANING[s])
         for s in used
     ]
-    entries.append(Line2D([], [], color=INK, marker="o", ls="", label="filled: tracked now"))
+    entries.append(entry(INK, marker="o", label="filled: tracked now"))
     if poses.marker_count:
-        entries.append(
-            Line2D([], [], color=INK, marker="o", ms=13, mfc="none", mew=2, ls="", label="marker, filtered")
-        )
+        entries.append(entry(INK, marker="o", ms=13, mfc="none", mew=2, label="marker, filtered"))
     entries += more
     if truth is not None:
-        entries.append(Line2D([], [], color=unit(TRUTH_RGB), ls="--", lw=1.3, label="truth"))
-    legend = figure.legend(
+        entries.append(entry(unit(TRUTH_RGB), ls="--", lw=1.3, label="truth"))
+    figure.legend(
         handles=entries,
         loc="upper left",
         bbox_to_anchor=(0.010, 0.85),
         frameon=False,
         fontsize=11,
         labelspacing=0.8,
+        labelcolor=INK,
     )
-    for text in legend.get_texts():
-        text.set_color(INK)
-
-
-def _source_rgb(code: int) -> Rgb:
-    return SOURCE_RGB[Source(code)] if code in set(Source) else SOURCE_RGB[Source.NONE]
-
-
-def _save(figure: Figure, path: Path) -> None:
-    try:
-        with replacing(path) as file:
-            # No creation date or version inside: the same run gives the same picture.
-            figure.savefig(file, format="png", dpi=_DPI, facecolor=PAPER, metadata={"Software": None})
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot write: {error.strerror or error}") from error

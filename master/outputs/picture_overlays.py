@@ -31,6 +31,7 @@ from master.outputs.drawing import (
     DevicePlace,
     ObjectAppearance,
     View,
+    entry,
     fan,
     fan_rays,
     series_rgb,
@@ -66,18 +67,16 @@ class WristPicture:
         rays = fan_rays(setup.wrist_rig, setup.wrist)
         return cls(setup.wrist_rig.name, setup.has_markers, setup.wrist, setup.wrist.optics, rays, frame)
 
+    def _place(self, poses: Poses, row: int) -> DevicePlace:
+        return DevicePlace.of(poses.rows(row, row + 1), self.setup.model)
+
     def pose(self, poses: Poses, row: int) -> Float:
         """Return the camera's pose (4, 4) in the frame of the poses; NaN: not known."""
-        if not self.in_rig:
-            return np.eye(4)
-        place = DevicePlace.of(poses.rows(row, row + 1), self.setup.model)
-        return place.cameras(self.setup.T_camera_palm)[0]
+        return self._place(poses, row).cameras(self.setup.T_camera_palm)[0] if self.in_rig else np.eye(4)
 
     def reach_m(self, poses: Poses, row: int) -> Float:
         """Return points (N, 3) [m] that must be in the picture: camera, or forearm end."""
-        if not self.in_rig:
-            return np.zeros((1, 3))
-        return DevicePlace.of(poses.rows(row, row + 1), self.setup.model).arm_m(_FOREARM_M)[0]
+        return self._place(poses, row).arm_m(_FOREARM_M)[0] if self.in_rig else np.zeros((1, 3))
 
     def draw_laser(self, axes: Axes, view: View, poses: Poses, row: int) -> list[Line2D]:
         """Draw laser fan, points, and in a rig the forearm; return the legend entries."""
@@ -92,23 +91,21 @@ class WristPicture:
         forearm = [self._draw_forearm(axes, view, poses, row)] if self.in_rig else []
         return [
             *forearm,
-            Line2D([], [], color=unit(LASER_RGB), lw=1.5, label="laser"),
-            Line2D([], [], color=unit(series_rgb(0)), marker="D", mec=PAPER, ms=9, ls="", label="laser on a finger"),
-        ]  # fmt: skip
+            entry(unit(LASER_RGB), "laser", "-", lw=1.5),
+            entry(unit(series_rgb(0)), "laser on a finger", marker="D", mec=PAPER, ms=9),
+        ]
 
     def _draw_forearm(self, axes: Axes, view: View, poses: Poses, row: int) -> Line2D:
         """Draw the forearm and its end at 2 sigma; return the legend entry."""
-        place = DevicePlace.of(poses.rows(row, row + 1), self.setup.model)
+        place, dashes = self._place(poses, row), (0, (4, 1.5))
         colour = unit(SOURCE_RGB[Source.WRIST])
         arm, ring = view.project(place.arm_m(_FOREARM_M)[0]), view.project(place.uncertainty_m(_FOREARM_M)[0])
-        axes.plot(arm[:, 0], arm[:, 1], color=colour, lw=3.0, ls=(0, (4, 1.5)), zorder=4)
+        axes.plot(arm[:, 0], arm[:, 1], color=colour, lw=3.0, ls=dashes, zorder=4)
         axes.plot(ring[:, 0], ring[:, 1], color=colour, lw=1.0, zorder=4)
         flexion, deviation = np.degrees(place.wrist_angles_rad[0])
-        known = np.isfinite(flexion)
-        wrist_angles = (
-            f"wrist bent {flexion:+.0f}°, {deviation:+.0f}°" if known else "bend of the wrist not known"
-        )
-        return Line2D([], [], color=colour, lw=3.0, ls=(0, (4, 1.5)), label=f"forearm, {wrist_angles}")
+        bend = f"wrist bent {flexion:+.0f}°, {deviation:+.0f}°"
+        bend = bend if np.isfinite(flexion) else "bend of the wrist not known"
+        return Line2D([], [], color=colour, lw=3.0, ls=dashes, label=f"forearm, {bend}")
 
     def draw_camera(self, figure: Figure, poses: Poses, row: int, truth: PosesTruth | None) -> None:
         """Draw the camera's frame, hand and laser points as it should see them."""
@@ -194,18 +191,14 @@ class ResultPicture:
                 at = view.project(transform(T, np.array([bead.position_m])))[0]
                 size = 2.0 * bead.radius_m * view.scale_px_m * 0.72  # points of 100 dots an inch
                 axes.plot(at[0], at[1], "o", ms=size, mfc=(*colour, 0.6), mec=INK, mew=1.2, zorder=4.7)
-            entries.append(
-                Line2D([], [], color=colour, marker="s", ms=11, ls="", label=f"{profile.name}, {look.value}")
-            )
+            entries.append(entry(colour, f"{profile.name}, {look.value}", marker="s", ms=11))
         for near in self.contacts:
             rows = np.flatnonzero(near.t_ns == t_ns)
             if len(rows) and near.touching[rows[0]].any():
                 at = view.project(near.point_m[rows[0]][near.touching[rows[0]]])
-                axes.plot(at[:, 0], at[:, 1], "x", color=(0.95, 0.25, 0.2), ms=10, mew=3.0, zorder=9)
-                touch = Line2D(
-                    [], [], color=(0.95, 0.25, 0.2), marker="x", ms=9, mew=3, ls="", label="touched"
-                )
-                entries.append(touch)
+                red = (0.95, 0.25, 0.2)
+                axes.plot(at[:, 0], at[:, 1], "x", color=red, ms=10, mew=3.0, zorder=9)
+                entries.append(entry(red, "touched", marker="x", ms=9, mew=3))
         return entries
 
     def draw_strip(self, figure: Figure, t_ns: Int, row: int) -> None:
@@ -255,18 +248,14 @@ class ResultPicture:
         profiles = {one.name: one for one in self.profiles}
         found: list[tuple[ObjectProfile, Float, ObjectAppearance]] = []
         for poses in self.objects:
-            row = int(nearest_rows(poses.t_ns, np.array([t_ns]))[0]) if len(poses) else -1
-            if (
-                row < 0
-                or abs(int(poses.t_ns[row]) - t_ns) > _NEAR_NS
-                or np.isnan(poses.position_m[row]).any()
-            ):
+            if not len(poses):
                 continue
-            tracked = ObjectAppearance.HIDDEN if poses.occluded[row] else ObjectAppearance.WHOLE
-            T = rigid(quaternion_to_matrix(poses.orientation_wxyz[row]), poses.position_m[row])
-            found.append(
-                (profiles[poses.object], T, tracked if poses.tracked[row] else ObjectAppearance.HELD)
-            )
+            row = int(nearest_rows(poses.t_ns, np.array([t_ns]))[0])
+            (pose,) = poses.rows(row, row + 1).messages()
+            look = ObjectAppearance.of(pose)
+            if abs(pose.t_ns - t_ns) <= _NEAR_NS and look is not ObjectAppearance.GONE:
+                T = rigid(quaternion_to_matrix(pose.orientation_wxyz), pose.position_m)
+                found.append((profiles[poses.object], T, look))
         return found
 
 

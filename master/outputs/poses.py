@@ -1,29 +1,37 @@
-"""Poses holds a run as arrays, its truth beside it, and its file poses.npz.
+"""Poses holds a run as arrays, its truth beside it, and the files of a run.
 
-poses.npz is readable with numpy. All files of a run are written at once; each appears under its name complete
-or not at all, and identical poses make identical bytes (`TableFile`).
+All files of a run are written at once; each appears under its name complete or not at all, and identical
+poses make identical bytes (`TableFile`).
 """
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from common.arrays import Bool, Code, Float, Int
-from common.errors import RecordingError
 from common.hand.model import MIDDLE_METACARPAL, MIDDLE_PROXIMAL
-from common.messages import FINGER_COUNT, JOINT_COUNT, Gesture, HandPose, ObjectPose, ResultMessage
-from common.recording.recorded_files import read_npz
-from master.outputs.result_files import GesturesFile, TableFile, contact_file, object_file
+from common.messages import Contact, HandPose, Message, ObjectPose, ResultMessage
+from master.outputs.result_files import (
+    GESTURES,
+    GesturesFile,
+    SpooledFile,
+    Table,
+    TableFile,
+    contact_path,
+    object_path,
+)
+from master.rig.setup import RigSetup
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Poses:
+class Poses(Table[HandPose]):
     """T poses of one hand, row by row; fields as in `HandPose`."""
 
+    kind = HandPose
     hand: str
     t_ns: Int  # (T,) [ns]
     position_m: Float  # (T, 26, 3) [m], rig frame
@@ -47,22 +55,10 @@ class Poses:
     wrist_angles_rad: Float  # (T, 2) of the wrist, where a device sits on the forearm; NaN: none
     wrist_angles_sigma_rad: Float  # (T, 2)
 
-    def __post_init__(self) -> None:
-        """Refuse arrays of shapes or types that do not fit together; ValueError."""
-        dtype = record(self.markers_m.shape[1] if self.markers_m.ndim == 3 else 0)
-        for name in dtype.names or ():
-            array = getattr(self, name)
-            kind, shape = dtype[name].base, (len(self.t_ns), *dtype[name].shape)
-            if array.shape != shape or array.dtype != kind:
-                raise ValueError(f"{name}: {array.dtype} {array.shape}, expected {kind} {shape}")
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
-
     @property
     def marker_count(self) -> int:
         """M."""
-        return self.markers_m.shape[1]
+        return self.markers_m.shape[1] if self.markers_m.ndim == 3 else 0
 
     @classmethod
     def of(cls, poses: Sequence[HandPose]) -> "Poses":
@@ -71,16 +67,9 @@ class Poses:
         Raises:
             ValueError: No pose, or poses of different hands or marker counts.
         """
-        if not poses:
-            raise ValueError("no poses to stack")
-        if len({(pose.hand, len(pose.markers_m)) for pose in poses}) > 1:
-            raise ValueError("poses of different hands or marker counts")
-        dtype = record(len(poses[0].markers_m))
-        arrays = {
-            name: np.array([getattr(pose, name) for pose in poses], dtype=dtype[name].base)
-            for name in dtype.names or ()
-        }
-        return cls(hand=poses[0].hand, **arrays)
+        if len({(pose.hand, len(pose.markers_m)) for pose in poses}) != 1:
+            raise ValueError("no poses to stack, or of different hands or marker counts")
+        return cls.stacked(poses, len(poses[0].markers_m), hand=poses[0].hand)
 
     @classmethod
     def joined(cls, batches: Sequence["Poses"]) -> "Poses":
@@ -91,51 +80,6 @@ class Poses:
             if one.name != "hand"
         }
         return cls(hand=batches[0].hand, **arrays)
-
-    def pose(self, index: int) -> HandPose:
-        """Row `index` as the message it came from."""
-        times = ("t_ns", "latency_ns")
-        arrays = {
-            f.name: getattr(self, f.name)[index] for f in fields(self) if f.name not in ("hand", *times)
-        }
-        return HandPose(
-            hand=self.hand, t_ns=int(self.t_ns[index]), latency_ns=int(self.latency_ns[index]), **arrays
-        )
-
-    def rows(self, start: int, stop: int) -> "Poses":
-        """Rows start..stop-1, without copying."""
-        arrays = {f.name: getattr(self, f.name)[start:stop] for f in fields(self) if f.name != "hand"}
-        return Poses(hand=self.hand, **arrays)
-
-
-def record(marker_count: int) -> np.dtype[np.void]:
-    """Return the type of a row of poses.npz; nothing else fixes names and shapes."""
-    j, m = JOINT_COUNT, marker_count
-    return np.dtype(
-        [
-            ("t_ns", "<i8"),
-            ("position_m", "<f8", (j, 3)),
-            ("orientation_wxyz", "<f8", (j, 4)),
-            ("radius_m", "<f8", (j,)),
-            ("valid", "?", (j,)),
-            ("tracked", "?", (j,)),
-            ("cov_m2", "<f8", (j, 3, 3)),
-            ("source", "u1", (j,)),
-            ("angles_rad", "<f8", (FINGER_COUNT, 4)),
-            ("markers_m", "<f8", (m, 3)),
-            ("markers_raw_m", "<f8", (m, 3)),
-            ("markers_cov_m2", "<f8", (m, 3, 3)),
-            ("inside_volume", "?", (j,)),
-            ("latency_ns", "<i8"),
-            ("laser_m", "<f8", (FINGER_COUNT, 3)),
-            ("solver_mode", "u1", (FINGER_COUNT,)),
-            ("ambiguous", "?", (FINGER_COUNT,)),
-            ("palm_world_wxyz", "<f8", (4,)),
-            ("palm_world_sigma_rad", "<f8", (2,)),
-            ("wrist_angles_rad", "<f8", (2,)),
-            ("wrist_angles_sigma_rad", "<f8", (2,)),
-        ]
-    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,20 +103,14 @@ class PosesTruth:
         return PosesTruth(self.joints_m[start:stop], self.markers_m[start:stop], laser_m)
 
     def errors_m(self, poses: Poses) -> dict[str, Float]:
-        """Map each measured quantity to its distances (T, K) [m]; NaN: unknown."""
-        joints = {"joints": self.joint_error_m(poses)}
+        """Map what was measured to its distances (T, K) [m]; NaN: unknown.
+
+        25 joints, without the palm; markers before the filter, or laser points.
+        """
+        joints = np.where(poses.valid, distance_m(poses.position_m, self.joints_m), np.nan)[:, 1:]
         if self.laser_m is None:
-            return joints | {"markers": self.marker_error_m(poses)}
-        return joints | {"laser": distance_m(poses.laser_m, self.laser_m)}
-
-    def joint_error_m(self, poses: Poses) -> Float:
-        """Return the distance (T, 25) [m] from the truth, without the palm; NaN: unknown."""
-        error = distance_m(poses.position_m, self.joints_m)
-        return np.where(poses.valid, error, np.nan)[:, 1:]
-
-    def marker_error_m(self, poses: Poses) -> Float:
-        """Distance (T, M) [m] of the unfiltered caps; NaN where not seen."""
-        return distance_m(poses.markers_raw_m, self.markers_m)
+            return {"joints": joints, "markers": distance_m(poses.markers_raw_m, self.markers_m)}
+        return {"joints": joints, "laser": distance_m(poses.laser_m, self.laser_m)}
 
 
 def distance_m(a: Float, b: Float) -> Float:
@@ -188,30 +126,19 @@ def mean_known(values: Float) -> Float:
     return np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0)
 
 
-class PosesFile:
-    """poses.npz of one hand, until `close` a spool."""
+class PosesFile(TableFile):
+    """poses.npz of one hand and its M markers, until `close` a spool."""
 
-    def __init__(self, path: Path, hand: str, marker_count: int) -> None:
-        """Open the spool for a hand and its M markers; RecordingError as `TableFile`."""
-        self._path, self._hand = path, hand
-        self._markers = (marker_count, 3)
-        self._file = TableFile(path, record(marker_count), {"hand": hand})
+    def __init__(self, path: Path, hand: str, markers: int) -> None:
+        super().__init__(path, HandPose, {"hand": hand}, markers)
+        self._markers = (markers, 3)
 
-    def write(self, pose: HandPose) -> None:
-        """Append one row.
-
-        Raises:
-            RecordingError: Disk full; the run's file is given up, see `close`.
-            ValueError: Another hand or marker count than the file was opened for, or it is closed.
-        """
-        if pose.hand != self._hand or pose.markers_m.shape != self._markers:
-            what = f"{pose.hand!r} with {len(pose.markers_m)} markers"
-            raise ValueError(f"{self._path}: a pose of {what} does not fit, opened for {self._hand!r}")
-        self._file.write(pose)
-
-    def close(self) -> None:
-        """Write the .npz; as `TableFile`."""
-        self._file.close()
+    def _encoded(self, message: Message) -> bytes:
+        assert isinstance(message, HandPose)
+        if message.hand != self._labels["hand"] or message.markers_m.shape != self._markers:
+            what = f"{message.hand!r} with {len(message.markers_m)} markers"
+            raise ValueError(f"{self._path}: a pose of {what} does not fit")
+        return super()._encoded(message)
 
 
 class RunFiles:
@@ -220,18 +147,24 @@ class RunFiles:
     def __init__(self, path: Path, marker_counts: Mapping[str, int], objects: Sequence[str] = ()) -> None:
         """Open the spools; `marker_counts`: hand profile -> M, the first at `path`."""
         first, folder = next(iter(marker_counts)), path.parent
-        self._hands = {
-            hand: PosesFile(path if hand == first else path_of_hand(path, hand), hand, count)
-            for hand, count in marker_counts.items()
-        }
-        self._objects = {name: object_file(folder, name) for name in objects}
-        self._contacts = {
-            (hand, name): contact_file(folder, hand, name)
-            for hand, count in marker_counts.items()
-            if count  # a wrist device alone measures no contact
-            for name in objects
-        }
-        self._gestures = GesturesFile(folder)
+        self._files: dict[tuple[str, ...], SpooledFile] = {}
+        for hand, count in marker_counts.items():
+            own = path if hand == first else path_of_hand(path, hand)
+            self._files["hand", hand] = PosesFile(own, hand, count)
+        for name in objects:
+            self._files["object", name] = TableFile(object_path(folder, name), ObjectPose, {"object": name})
+            for hand, count in marker_counts.items():
+                if count:  # a wrist device alone measures no contact
+                    labels = {"hand": hand, "object": name}
+                    file = TableFile(contact_path(folder, hand, name), Contact, labels)
+                    self._files["contact", hand, name] = file
+        self._files["gestures",] = GesturesFile(folder / GESTURES)
+
+    @classmethod
+    def of(cls, path: Path, setups: Sequence[RigSetup]) -> "RunFiles":
+        """The files of all hands and objects of these setups."""
+        counts = {setup.hand.profile.name: len(setup.markers) for setup in setups}
+        return cls(path, counts, [one.name for setup in setups for one in setup.objects])
 
     def write(self, message: ResultMessage) -> None:
         """Append a row to the file of its hand or object.
@@ -240,51 +173,30 @@ class RunFiles:
             RecordingError: Disk full; the file is given up.
             ValueError: A hand or object that they were not opened for, or another marker count, or they are closed.
         """
-        if isinstance(message, Gesture):
-            self._gestures.write(message)
-        elif isinstance(message, HandPose):
-            if message.hand not in self._hands:
-                raise ValueError(
-                    f"a pose of {message.hand!r} does not fit, opened for {', '.join(self._hands)}"
-                )
-            self._hands[message.hand].write(message)
-        elif isinstance(message, ObjectPose):
-            if message.object not in self._objects:
-                opened = ", ".join(self._objects) or "none"
-                raise ValueError(f"a pose of object {message.object!r} does not fit, opened for {opened}")
-            self._objects[message.object].write(message)
-        else:
-            if (message.hand, message.object) not in self._contacts:
-                raise ValueError(f"contact of {message.hand!r} and {message.object!r} does not fit")
-            self._contacts[message.hand, message.object].write(message)
+        match message:
+            case HandPose():
+                key = "hand", message.hand
+            case ObjectPose():
+                key = "object", message.object
+            case Contact():
+                key = "contact", message.hand, message.object
+            case _:
+                key = ("gestures",)
+        if key not in self._files:
+            opened = (
+                ", ".join(" and ".join(other) for kind, *other in self._files if kind == key[0]) or "none"
+            )
+            what = f"{key[0]} {' and '.join(map(repr, key[1:]))}"
+            raise ValueError(f"a pose of {what} does not fit, opened for {opened}")
+        self._files[key].write(message)
 
     def close(self) -> None:
         """Write each file, also where another one cannot be completed; RecordingError."""
         with ExitStack() as all_of_them:
-            files = (*self._hands.values(), *self._objects.values(), *self._contacts.values(), self._gestures)
-            for file in files:
+            for file in self._files.values():
                 all_of_them.callback(file.close)
 
 
 def path_of_hand(path: Path, hand: str) -> Path:
     """Name the poses file of a hand other than the first: poses-HAND.npz."""
     return path.with_name(f"{path.stem}-{hand}{path.suffix}")
-
-
-def save_poses(path: Path, poses: Poses) -> None:
-    """Write poses.npz in one call; RecordingError as `PosesFile`."""
-    file = PosesFile(path, poses.hand, poses.marker_count)
-    for index in range(len(poses)):
-        file.write(poses.pose(index))
-    file.close()
-
-
-def load_poses(path: Path) -> Poses:
-    """Read a poses.npz; RecordingError: missing, or not of this type and shape."""
-    names = [*(record(0).names or ()), "hand"]
-    arrays = read_npz(path, names, "not a poses.npz of ours")
-    hand = str(arrays.pop("hand"))
-    try:
-        return Poses(hand=hand, **cast(dict[str, Any], arrays))
-    except (ValueError, AttributeError) as error:
-        raise RecordingError(f"{path}: not a poses.npz: {error}") from error

@@ -16,10 +16,8 @@ import threading
 import time
 from bisect import bisect_right
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Literal, TypeVar
 from urllib.parse import quote
 
@@ -30,7 +28,17 @@ from common.arrays import Image
 from common.bus.bus import Bus, Subscription
 from common.clock import now_ns
 from common.errors import PhalanxError, RecordingError
-from common.messages import Detections, HandPose, Health, Message, Preview, ResultMessage
+from common.messages import (
+    Contact,
+    Detections,
+    Gesture,
+    HandPose,
+    Health,
+    Message,
+    ObjectPose,
+    Preview,
+    ResultMessage,
+)
 from common.messages.streams import MASTER
 from master.outputs.bus import PictureAsker
 from master.outputs.poses import Poses, PosesTruth
@@ -124,16 +132,6 @@ class ViewerProcess:
                 self._child.wait()
         self._folder.cleanup()
 
-    def __enter__(self) -> "ViewerProcess":
-        """The viewer itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """End it."""
-        self.close()
-
     def check(self) -> None:
         """Do nothing while it runs or its user closed it; else PhalanxError has why."""
         if not self.alive() and self._child.returncode != 0:
@@ -165,8 +163,7 @@ def viewer_arguments(port: int, web_port: int | None) -> list[str]:
 
 def _program() -> str:
     folder = Path(next(iter(rerun_cli.__path__)))
-    names = ("rerun", "rerun.exe", "Rerun.app/Contents/MacOS/Rerun")
-    for name in names:
+    for name in ("rerun", "rerun.exe", "Rerun.app/Contents/MacOS/Rerun"):
         if (folder / name).is_file():
             return str(folder / name)
     raise PhalanxError(f"{folder}: the viewer is missing; reinstall rerun-sdk")
@@ -181,34 +178,10 @@ def _free_port() -> int:
 Mode = Literal["spawn", "web", "save"]
 
 _APPLICATION = "phalanx"
+_RESULTS = {"object": ObjectPose, "contact": Contact, "gesture": Gesture}
 
 _log = logging.getLogger(__name__)
 _Kind = TypeVar("_Kind", bound=Message)
-
-
-@dataclass(frozen=True, slots=True)
-class _Subscribers:
-    """What comes from the bus."""
-
-    hands: Subscription
-    results: tuple[Subscription, ...]  # objects, contact, gestures
-    reports: Subscription
-    pictures: Subscription
-
-    @classmethod
-    def of(cls, bus: Bus) -> "_Subscribers":
-        depth = 256
-        preview_depth = 16
-        return cls(
-            bus.subscribe("hand", depth=depth),
-            tuple(bus.subscribe(stream, depth=depth) for stream in ("object", "contact", "gesture")),
-            bus.subscribe("health", depth=depth),
-            bus.subscribe("preview", depth=preview_depth),
-        )
-
-    def close(self) -> None:
-        for subscriber in (self.hands, *self.results, self.reports, self.pictures):
-            subscriber.close()
 
 
 def run_viewer(
@@ -239,14 +212,18 @@ def run_viewer(
     if (mode == "save") != (path is not None):
         raise ValueError(f"mode {mode!r} with path {path}: a path belongs to mode 'save' and only to it")
     with ExitStack() as stack:
-        subscribers = _Subscribers.of(bus)
-        stack.callback(subscribers.close)
+        inboxes = {
+            stream: stack.enter_context(
+                closing(bus.subscribe(stream, depth=16 if stream == "preview" else 256))
+            )
+            for stream in ("hand", *_RESULTS, "health", "preview")
+        }
         recording, alive = stack.enter_context(_opened(mode, path, web_port, on_ready))
         recording.send_blueprint(blueprint(setups, live=mode != "save", with_truth=False))
         scene = RerunScene(recording, setups)
         asker = PictureAsker(bus, tuple(dict.fromkeys(name for one in setups for name in one.camera_names)))
         stack.callback(asker.close)
-        return _pump(scene, recording, subscribers, lambda: alive() and not stop.is_set())
+        return _pump(scene, recording, inboxes, lambda: alive() and not stop.is_set())
 
 
 def write_rrd(
@@ -292,7 +269,10 @@ def write_rrd(
 
 
 def _pump(
-    scene: RerunScene, recording: rr.RecordingStream, subscribers: _Subscribers, go_on: Callable[[], bool]
+    scene: RerunScene,
+    recording: rr.RecordingStream,
+    inboxes: Mapping[str, Subscription],
+    go_on: Callable[[], bool],
 ) -> int:
     """Move messages from the bus to the scene while `go_on`, and the last after it."""
     shown, flush_ns, going = 0, now_ns(), True
@@ -300,20 +280,15 @@ def _pump(
     while going:
         going = go_on()
         # Before the poses: a report or picture never overtakes a pose sent before it.
-        reports, pictures = _waiting(subscribers.reports, Health), _waiting(subscribers.pictures, Preview)
+        reports, pictures = _waiting(inboxes["health"], Health), _waiting(inboxes["preview"], Preview)
         for health in reports:
             at_ns = health.t_ns if health.source == MASTER else at_ns
-        for poses in _by_hand(_drain(subscribers.hands)):
+        for poses in _by_hand(_drain(inboxes["hand"])):
             scene.log_poses(poses)
             shown += len(poses)
             at_ns = scene.last_t_ns
         scene.log_results(
-            [
-                one
-                for subscriber in subscribers.results
-                for one in _waiting(subscriber, Message)
-                if isinstance(one, ResultMessage)
-            ]
+            [one for stream, kind in _RESULTS.items() for one in _waiting(inboxes[stream], kind)]
         )
         if at_ns is not None:  # the slaves' clocks are their own: what they send stands at the master's time
             for health in reports:
@@ -328,13 +303,9 @@ def _pump(
     return shown
 
 
-def _waiting(subscriber: Subscription, kind: type[_Kind]) -> list[_Kind]:
+def _waiting(inbox: Subscription, kind: type[_Kind]) -> list[_Kind]:
     """The messages that have arrived."""
-    received: list[_Kind] = []
-    while (message := subscriber.get(0.0)) is not None:
-        if isinstance(message, kind):
-            received.append(message)
-    return received
+    return [message for message in iter(lambda: inbox.get(0.0), None) if isinstance(message, kind)]
 
 
 def _drain(hands: Subscription) -> list[HandPose]:
@@ -372,7 +343,7 @@ def _opened(
             on_ready(f"recording to {path}")
             yield recording, lambda: True
         return
-    with ViewerProcess(web_port if mode == "web" else None) as viewer:
+    with closing(ViewerProcess(web_port if mode == "web" else None)) as viewer:
         recording = rr.RecordingStream(_APPLICATION)
         # The port was seen open: connecting to a dead viewer would block for seconds.
         recording.connect_grpc(viewer.url)

@@ -197,24 +197,36 @@ class Columns:
         )
         self.send(path, t_ns, columns, shown.sum(axis=1))
 
+    def strips(
+        self,
+        path: str,
+        t_ns: Int,
+        strips: Sequence[Float],
+        lengths: Int,
+        colours: int | npt.NDArray[np.uint32],
+        radius_m: float,
+        labels: Sequence[str] | None = None,
+    ) -> None:
+        """Send line strips (K, 3), `lengths` (T,) of them a row, in given colours."""
+        count = len(strips)
+        columns = rr.LineStrips3D.columns(
+            strips=strips,
+            radii=np.full(count, radius_m),
+            colors=np.full(count, colours, np.uint32),
+            labels=labels,
+        )
+        self.send(path, t_ns, columns, lengths)
+
     def rays(self, path: str, t_ns: Int, origin: Float, to: Float, colour: int) -> None:
         """Lines from `origin` (3,) to those of the points (T, N, 3) that are not NaN."""
         shown = seen(to)
-        lines = [np.stack([origin, point]) for point in to[shown]]
-        columns = rr.LineStrips3D.columns(
-            strips=lines, radii=np.full(len(lines), 0.0003), colors=np.full(len(lines), colour, np.uint32)
-        )
-        self.send(path, t_ns, columns, shown.sum(axis=1))
+        rays = [np.stack([origin, point]) for point in to[shown]]
+        self.strips(path, t_ns, rays, shown.sum(axis=1), colour, 0.0003)
 
     def lines(self, path: str, t_ns: Int, strips: Float, colour: int, radius_m: float) -> None:
         """One line a row through its points (T, K, 3); none where one of them is NaN."""
-        shown = np.asarray(seen(strips).all(axis=1))
-        columns = rr.LineStrips3D.columns(
-            strips=list(strips[shown]),
-            radii=np.full(shown.sum(), radius_m),
-            colors=np.full(shown.sum(), colour, np.uint32),
-        )
-        self.send(path, t_ns, columns, np.asarray(shown, np.int64))
+        shown = np.asarray(seen(strips).all(axis=1), np.bool_)
+        self.strips(path, t_ns, list(strips[shown]), shown.astype(np.int64), colour, radius_m)
 
     def scalars(self, path: str, t_ns: Int, values: Float) -> None:
         """Send one number per row; at NaN the viewer breaks the line."""

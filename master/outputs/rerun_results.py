@@ -20,17 +20,15 @@ from dataclasses import dataclass
 from math import isfinite
 
 import numpy as np
-import numpy.typing as npt
 import rerun as rr
 
-from common.arrays import Bool, Float, Int
+from common.arrays import Float
 from common.calibration.object_profile import BoxShape, CylinderShape, ObjectProfile, Shape
 from common.geometry.tag_family import tag_image
 from common.geometry.transforms import matrix_to_quaternion
-from common.hand.model import FINGERS, PALM, TIPS
-from common.messages import Contact, Gesture, ObjectPose, ResultMessage
+from common.hand.model import FINGERS
+from common.messages import Contact, Gesture, ObjectPose
 from master.outputs.drawing import GESTURE_RGB, OBJECT_RGB, TOUCH_RGB, ObjectAppearance, Rgb, pack, series_rgb
-from master.outputs.poses import Poses
 from master.outputs.rerun_blueprint import EVENTS, WORLD, Columns, States, seen
 
 _LINE_M = 0.0012
@@ -211,32 +209,15 @@ class ObjectsLayer:
             radii = np.where(touching, touch_m, spot_m)[near]
             self._rows.points(f"{root}/points", t, point, near, colours, radii)
             tips = np.array([tips_m.get((hand, one.t_ns), _UNKNOWN)[:5] for one in own])
-            self._gaps(
-                f"{root}/gaps", t, np.stack([tips, point], axis=2), near & seen(tips), distance, colours
-            )
+            lines, near = np.stack([tips, point], axis=2), near & seen(tips)
+            labels = [f"{value:.0f} mm" for value in (distance[near] * 1e3).tolist()]
+            gaps = list(lines[near])
+            self._rows.strips(f"{root}/gaps", t, gaps, near.sum(axis=1), colours[near], 0.0006, labels)
             for i, finger in enumerate(FINGERS):
                 self._rows.scalars(_plot(name, finger), t, distance[:, i] * 1e3)
             for one in own:
                 state = "held" if one.held else "touched" if one.touching.any() else None
                 self._states.log(f"{hand}/{name}", one.t_ns, state)
-
-    def _gaps(
-        self,
-        path: str,
-        t_ns: Int,
-        lines: Float,
-        shown: Bool,
-        distance_m: Float,
-        colours: npt.NDArray[np.uint32],
-    ) -> None:
-        """Lines (T, 5, 2, 3) that are `shown` (T, 5), each with its distance beside it."""
-        strips = list(lines[shown])
-        labels = [f"{value:.0f} mm" for value in (distance_m[shown] * 1e3).tolist()]
-        line_m = 0.0006
-        columns = rr.LineStrips3D.columns(
-            strips=strips, radii=np.full(len(strips), line_m), colors=colours[shown], labels=labels
-        )
-        self._rows.send(path, t_ns, columns, shown.sum(axis=1))
 
     def _dress(self, root: str, shown: _Shown, look: ObjectAppearance) -> None:
         """Show the object as it is known now, from the time that is set on."""
@@ -324,30 +305,3 @@ def _tag_mesh(profile: ObjectProfile, number: int) -> rr.Mesh3D:
         vertex_texcoords=[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]],
         albedo_texture=np.repeat(image[..., None], 3, axis=2),
     )
-
-
-_NAMED = [*TIPS.tolist(), PALM]
-
-
-class ResultLayer:
-    """Logger of results; contact and gestures are drawn at their own epoch's joints."""
-
-    def __init__(self, recording: rr.RecordingStream, objects: Sequence[ObjectProfile]) -> None:
-        states = States(recording)
-        self._objects = ObjectsLayer(recording, states, objects)
-        self._gestures = GesturesLayer(recording, states)
-        self._joints: dict[tuple[str, int], Float] = {}
-
-    def remember(self, poses: Poses) -> None:
-        """Take the poses of a hand, before the results that refer to them."""
-        at = np.where(poses.valid[..., None], poses.position_m, np.nan)[:, _NAMED]
-        self._joints |= {(poses.hand, t): row for t, row in zip(poses.t_ns.tolist(), at, strict=True)}
-        remembered = 1024  # poses
-        for old in list(self._joints)[: -max(remembered, len(poses))]:
-            del self._joints[old]
-
-    def log(self, results: Sequence[ResultMessage]) -> None:
-        """Log a batch, each kind in the order of time; hands are passed over."""
-        self._objects.log_poses([one for one in results if isinstance(one, ObjectPose)])
-        self._objects.log_contacts([one for one in results if isinstance(one, Contact)], self._joints)
-        self._gestures.log([one for one in results if isinstance(one, Gesture)], self._joints)

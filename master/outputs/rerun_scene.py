@@ -39,13 +39,16 @@ from common.calibration import Volume
 from common.errors import PictureError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import matrix_to_quaternion, quaternion_to_matrix
-from common.hand.model import FINGER_JOINTS, FINGERS, TIPS, WRIST, HandModel
+from common.hand.model import FINGER_JOINTS, FINGERS, PALM, TIPS, WRIST, HandModel
 from common.hand.profiles import FLEXION
 from common.messages import (
     FINGER_COUNT,
+    Contact,
     Detections,
+    Gesture,
     Health,
     MarkerDetections,
+    ObjectPose,
     ResultMessage,
     Source,
     WristDetections,
@@ -65,8 +68,17 @@ from master.outputs.drawing import (
     series_rgb,
 )
 from master.outputs.poses import Poses, PosesTruth, distance_m, mean_known
-from master.outputs.rerun_blueprint import PIXEL_CENTRE, TIMELINE, WORLD, Columns, camera_path, legend, seen
-from master.outputs.rerun_results import ResultLayer
+from master.outputs.rerun_blueprint import (
+    PIXEL_CENTRE,
+    TIMELINE,
+    WORLD,
+    Columns,
+    States,
+    camera_path,
+    legend,
+    seen,
+)
+from master.outputs.rerun_results import GesturesLayer, ObjectsLayer
 from master.rig.setup import RigSetup
 from master.rig.wrist import WristSetup
 
@@ -274,7 +286,10 @@ class RerunScene:
         self._models = {name: model for setup in setups for name, model in setup.models.items()}
         self._devices: dict[str, WristLayer] = {}
         objects = {profile.name: profile for setup in setups for profile in setup.objects}
-        self._results = ResultLayer(recording, list(objects.values()))
+        states = States(recording)
+        self._objects = ObjectsLayer(recording, states, list(objects.values()))
+        self._gestures = GesturesLayer(recording, states)
+        self._joints: dict[tuple[str, int], Float] = {}  # hand and time -> tips and palm (6, 3) [m]
         self._recent_ns: Int = np.empty(0, np.int64)
         self._styled: set[str] = set()
         recording.log(WORLD, rr.ViewCoordinates.RDF, static=True)
@@ -321,11 +336,18 @@ class RerunScene:
         self._log_plots(poses, setup)
         if truth is not None:
             self._log_truth(poses, truth)
-        self._results.remember(poses)
+        # contact and gestures are drawn at the joints of their own epoch
+        at = np.where(poses.valid[..., None], poses.position_m, np.nan)[:, [*TIPS.tolist(), PALM]]
+        self._joints |= {(poses.hand, t): row for t, row in zip(poses.t_ns.tolist(), at, strict=True)}
+        remembered = 1024  # poses
+        for old in list(self._joints)[: -max(remembered, len(poses))]:
+            del self._joints[old]
 
     def log_results(self, results: Sequence[ResultMessage]) -> None:
         """Log objects, contact and gestures in time order, after their hands' poses."""
-        self._results.log(results)
+        self._objects.log_poses([one for one in results if isinstance(one, ObjectPose)])
+        self._objects.log_contacts([one for one in results if isinstance(one, Contact)], self._joints)
+        self._gestures.log([one for one in results if isinstance(one, Gesture)], self._joints)
 
     def log_detections(self, detections: Iterable[Detections]) -> None:
         """Log what one camera saw, in its image; frames in the order of time."""
@@ -396,12 +418,7 @@ class RerunScene:
         colours = palette[np.where(poses.source < len(palette), poses.source, 0)]
         strips = _strips(at, shown)
         strip_colours = colours[:, _STRIP_SOURCE][shown]
-        self._rows.send(
-            f"{root}/skeleton",
-            poses.t_ns,
-            rr.LineStrips3D.columns(strips=strips, colors=strip_colours, radii=np.full(len(strips), 0.0018)),
-            shown.sum(axis=1),
-        )
+        self._rows.strips(f"{root}/skeleton", poses.t_ns, strips, shown.sum(axis=1), strip_colours, 0.0018)
         colours = np.where(poses.tracked, colours, dim(colours))
         joint_shown = 0.45  # of its radius, so that the bones stay visible
         radii = (poses.radius_m * joint_shown)[valid]
@@ -471,13 +488,12 @@ class RerunScene:
     def _log_truth(self, poses: Poses, truth: PosesTruth) -> None:
         t, at, group = poses.t_ns, truth.joints_m, self._group(poses.hand)
         known = np.stack([np.isfinite(at[:, list(strip)]).all(axis=(1, 2)) for strip in _STRIPS], axis=1)
-        strips = _strips(at, known)
-        grey = np.full(len(strips), pack([TRUTH_RGB])[0])
-        columns = rr.LineStrips3D.columns(strips=strips, colors=grey, radii=np.full(len(strips), 0.0008))
-        self._rows.send(f"{WORLD}/truth{group}/skeleton", t, columns, known.sum(axis=1))
+        grey = int(pack([TRUTH_RGB])[0])
+        path = f"{WORLD}/truth{group}/skeleton"
+        self._rows.strips(path, t, _strips(at, known), known.sum(axis=1), grey, 0.0008)
         name, points = ("markers", truth.markers_m) if truth.laser_m is None else ("laser", truth.laser_m)
-        grey = np.full(points.shape[:2], pack([TRUTH_RGB])[0])
-        self._rows.points(f"{WORLD}/truth{group}/{name}", t, points, seen(points), grey, 0.002)
+        colours = np.full(points.shape[:2], grey, np.uint32)
+        self._rows.points(f"{WORLD}/truth{group}/{name}", t, points, seen(points), colours, 0.002)
         for i, (name, error) in enumerate(truth.errors_m(poses).items()):
             path = f"plots/error_mm{group}/{name}"
             if path not in self._styled:

@@ -9,7 +9,7 @@ import sys
 import threading
 from argparse import Namespace
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
@@ -21,7 +21,7 @@ from common.clock import SystemClock, now_ns
 from common.command_line import echo
 from common.errors import PhalanxError, RecordingError
 from common.machine import program
-from common.messages import WIRE_VERSION, Command, Health, Message
+from common.messages import WIRE_VERSION, Command, Health
 from common.messages.streams import MASTER
 from common.recording.messages import MessageRecording, open_messages
 from master.outputs.bus import BusSink, Sink
@@ -73,17 +73,9 @@ def run_play(
         sinks: list[Sink] = [] if bus is None else [BusSink(bus)]
         if settings.out is not None:
             settings.out.mkdir(parents=True, exist_ok=True)
-            counts = {setup.hand.profile.name: len(setup.markers) for setup in setups}
-            objects = [one.name for setup in setups for one in setup.objects]
-            sinks.append(RunFiles(settings.out / "poses.npz", counts, objects))
+            sinks.append(RunFiles.of(settings.out / "poses.npz", setups))
             stack.callback(sinks[-1].close)
-        probe = None if bus is None else Probe(bus, SystemClock())
-        if probe is not None:
-            stack.callback(probe.close)
-
-        def again(stream: str, name: str, message: Message) -> None:
-            if bus is not None:
-                bus.publish(stream, name, message)
+        probe = None if bus is None else stack.enter_context(closing(Probe(bus, SystemClock())))
 
         def at(seconds: float | None) -> int | None:
             return None if seconds is None else recording.begin_t_ns + round(seconds * 1e9)
@@ -97,14 +89,13 @@ def run_play(
                 from_ns=at(settings.from_s),
                 to_ns=at(settings.to_s),
                 solved=settings.solved,
-                again=again,
-                observed=(lambda _message: None) if probe is None else probe.show,
+                bus=bus,
+                probe=probe,
                 notify=notify,
             )
         except ValueError as error:
             raise PhalanxError(f"{settings.path}: {error}") from error
-        host = _Host(player, recording, bus, probe, stop, show)
-        stack.callback(host.close)
+        host = stack.enter_context(closing(_Host(player, recording, bus, probe, stop, show)))
         passed = player.run()
         while settings.loop and not stop.is_set():
             notify("again from the beginning")
@@ -237,12 +228,8 @@ def play(options: Namespace) -> None:
         done = position_s / length_s if length_s > 0.0 else 1.0
         line.show(f"{bar(done)} {position_s:.1f} of {length_s:.1f} s")
 
-    connection = None if options.no_bus else host_bus(options.bus)
-    try:
-        passed = run_play(settings, connection, stop, _player_status, show)
-    finally:
-        if connection is not None:
-            connection.close()
+    with nullcontext() if options.no_bus else closing(host_bus(options.bus)) as bus:
+        passed = run_play(settings, bus, stop, lambda text: echo(f"play: {text}"), show)
     poses = passed.digest.counts["poses"]
     line.end(f"{poses} poses in {passed.seconds:.2f} s, {passed.poses_per_s:.0f} poses/s")
     if not passed.whole:
@@ -260,7 +247,3 @@ def _speed(text: str) -> float:
     if not 0.0 < factor <= 1000.0 and text != "max":
         raise PhalanxError(f"--speed {text}: must be max, or a number above 0 and at most 1000")
     return factor
-
-
-def _player_status(line: str) -> None:
-    echo(f"play: {line}")

@@ -15,12 +15,14 @@ from typing import cast
 
 import msgspec
 
+from common.bus.bus import Bus
 from common.clock import now_ns
 from common.errors import PhalanxError
-from common.messages import Backlog, Contact, Gesture, HandPose, Message, ObjectPose, ResultMessage, encode
+from common.messages import Backlog, Contact, Gesture, HandPose, ObjectPose, ResultMessage, encode
 from common.recording.messages import MessageRecording, Recorded
 from master.outputs.bus import Sink
 from master.recording.lines import EventMonitor
+from master.recording.probe import Probe
 from master.rig.setup import RigSetup
 from master.run.app import Solved, StageTimes
 from master.run.dispatcher import Dispatcher
@@ -161,8 +163,8 @@ class Player:
         from_ns: int | None = None,
         to_ns: int | None = None,
         solved: bool = False,
-        again: Callable[[str, str, Message], None] = lambda _stream, _name, _message: None,
-        observed: Callable[[Message], None] = lambda _message: None,
+        bus: Bus | None = None,
+        probe: Probe | None = None,
         notify: Callable[[str], None] = lambda _line: None,
     ) -> None:
         """Stand at the beginning.
@@ -171,15 +173,15 @@ class Player:
             speed: 1: as it was; 0: as fast as it goes.
             from_ns, to_ns: The stretch that is played, log times [ns]; None: all.
             solved: Publish what was published live instead of solving.
-            again: Takes reports, lists and pictures that were recorded beside.
-            observed: Shown each message that was taken, once all that it yields is out.
+            bus: Where reports, lists and pictures that were recorded beside are published again.
+            probe: Shown each message that was taken, once all that it yields is out.
             notify: Called with a line where something happened that a replay cannot repeat.
 
         Raises:
             ValueError: The speed is none, or the stretch is empty.
         """
         self._recording, self._setups, self._sinks, self._solved = recording, setups, sinks, solved
-        self._again, self._observed, self._notify = again, observed, notify
+        self._bus, self._probe, self._notify = bus, probe, notify
         self.first_ns = recording.begin_t_ns if from_ns is None else max(from_ns, recording.begin_t_ns)
         self.last_ns = recording.end_t_ns if to_ns is None else min(to_ns, recording.end_t_ns)
         if self.first_ns > self.last_ns:
@@ -330,10 +332,10 @@ class Player:
             self.poses += isinstance(message, HandPose)
 
     def _auxiliary(self, one: Recorded) -> None:
-        if one.stream == "taken":
-            self._observed(one.message)
-        elif one.stream in AUXILIARY and one.name not in _OWN:
-            self._again(one.stream, one.name, one.message)
+        if one.stream == "taken" and self._probe is not None:
+            self._probe.show(one.message)
+        elif self._bus is not None and one.stream in AUXILIARY and one.name not in _OWN:
+            self._bus.publish(one.stream, one.name, one.message)
 
     def _print_events(self, lines: Sequence[str]) -> None:
         for line in lines:

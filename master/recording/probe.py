@@ -1,9 +1,9 @@
 """A running master publishes its inputs while a recorder asks for them.
 
 A message goes on the bus (stream `taken`) once all that it yields is out, in the order of receipt, with those
-of the same fifth of a second, on a thread of its own: no pose waits for it. That thread may wait for a
-reader, so that none is lost on the way; where it waits for too long, what does not fit its queue is dropped
-and counted. While nobody taps, there is no thread, and a message costs one comparison.
+of the same fifth of a second, by a `Worker`: no pose waits for it. The worker may wait for a reader, so that
+none is lost on the way; where it waits for too long, what does not fit its queue is dropped and counted.
+While nobody taps, a message costs one comparison.
 
 `phalanx run --record FILE` starts a recorder process, which is there before the first message is taken, so
 that a replay is what was published live from the first pose on. When its standard input, a pipe from this
@@ -16,7 +16,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
@@ -27,6 +26,7 @@ from common.errors import BusError, RecordingError
 from common.messages import Backlog, Message
 from common.messages.streams import MASTER, sender_of
 from master.outputs.bus import Receive
+from master.outputs.worker import Worker
 from master.rig.setup import RigFiles
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 LEASE_NS = 3_000_000_000
 _DRAIN_S = 5.0
-_STEP_S = 0.01
 
 ReceivedT = TypeVar("ReceivedT", bound=Message)
 
@@ -46,29 +45,24 @@ class Probe:
         """Show nothing until `lease`; with `always` everything from the first message on."""
         self._bus, self._clock, self._always = bus, clock, always
         self._until_ns = 0
-        self._queue: deque[Message] = deque()
-        self._lock = threading.Lock()
-        self._thread: threading.Thread | None = None
-        self._load_shedding = threading.Event()
-        self._busy = self._closed = False
+        self._at_once = threading.Event()
         self._shown = self._dropped = 0
         self._skipped, self._again = 0, False  # as was shown last; a reader may not have been there
-        if always:
-            self._start()
+        self._worker = Worker[Message]("tap", self._work, 20_000)  # some seconds
+        self._worker.start()
 
     @property
     def counts(self) -> dict[str, int]:
         """`tap.shown`, and of those `tap.dropped`, once there were any."""
+        if not self._shown:
+            return {}
         # What waits to be published can be nobody's loss yet.
-        return (
-            {"tap.shown": self._shown - len(self._queue), "tap.dropped": self._dropped} if self._shown else {}
-        )
+        return {"tap.shown": self._shown - self._worker.waiting, "tap.dropped": self._dropped}
 
     def lease(self) -> None:
         """Show everything for three seconds from now, and how far behind the master is."""
         self._again = True
         self._until_ns = self._clock.now_ns() + LEASE_NS
-        self._start()
 
     def show(self, message: Message, skip: int = 0) -> None:
         """Queue a message if somebody taps, after the number of dropped epochs if new."""
@@ -86,11 +80,7 @@ class Probe:
 
     def _put(self, message: Message) -> None:
         self._shown += 1
-        capacity = 20_000  # messages, some seconds
-        if len(self._queue) >= capacity:
-            self._dropped += 1
-        else:
-            self._queue.append(message)  # nobody is woken: the thread looks by itself
+        self._dropped += self._worker.offer(message) is not None
 
     def end_always(self) -> None:
         """Show messages only to those who tap: the recorder that wanted all is gone."""
@@ -98,45 +88,25 @@ class Probe:
 
     def drain(self) -> None:
         """Wait until all that was shown is on its way, at most some seconds."""
-        self._start()
-        self._load_shedding.set()
-        deadline = time.monotonic() + _DRAIN_S
-        while (self._queue or self._busy) and time.monotonic() < deadline:
-            time.sleep(_STEP_S)
-        self._load_shedding.clear()
+        self._at_once.set()
+        self._worker.drain(_DRAIN_S)
+        self._at_once.clear()
 
     def close(self) -> None:
         """Show nothing any more. Safe to call twice."""
-        with self._lock:
-            self._closed, thread = True, self._thread
-        self._queue.clear()
-        self._load_shedding.set()
-        if thread is not None:
-            thread.join(_DRAIN_S)
-
-    def _start(self) -> None:
-        with self._lock:
-            if self._thread is None and not self._closed:
-                self._thread = threading.Thread(target=self._work, name="tap", daemon=True)
-                self._thread.start()
+        self._worker.clear()
+        self._at_once.set()
+        self._worker.close(_DRAIN_S)
 
     def _work(self) -> None:
-        """Publish what waits at once, to travel together; end when nobody taps."""
-        while True:
-            while self._queue and not self._closed:
-                self._busy = True
-                message = self._queue.popleft()
+        while self._worker.wait():
+            together_s = 0.2  # to wake a thread and a link for each message would cost several times as much
+            self._at_once.wait(together_s)
+            while (message := self._worker.take(0.0)) is not None:
                 try:
                     self._bus.publish("taken", sender_of(message), message)
                 except BusError:
                     self._dropped += 1  # the bus is closed: the master ends
-            self._busy = False
-            with self._lock:
-                if self._closed or not (self._always or self._until_ns or self._queue):
-                    self._thread = None
-                    return
-            together_s = 0.2  # to wake a thread and a link for each message would cost several times as much
-            self._load_shedding.wait(_STEP_S if self._load_shedding.is_set() else together_s)
 
 
 def came_ns(message: Message, now_ns: int) -> int:

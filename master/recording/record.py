@@ -11,7 +11,7 @@ import threading
 from argparse import Namespace
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -189,33 +189,16 @@ def run_recorder(
         CalibrationError: The rig's files are broken.
         BusError: The master cannot be tapped.
     """
-    setups = settings.files.load()
-    carried = carried_files(settings.files, setups)
-    cameras = tuple(dict.fromkeys(name for setup in setups for name in setup.camera_names))
-    clock = MasterClock()
-    raw = RawAsker(
-        settings.path.stem,
-        cameras if settings.raw else (),
-        notify,
-        lambda health: recorder.offer("health", health, clock.now_ns()),
-    )
-    about = {"rigs": rigs_text(settings.files.rigs)}
-    if settings.raw:
-        about["raw"] = raw_text(settings.path.stem, cameras)
-    writer = MessageWriter(settings.path, carried, about)
-    recorder = MessageRecorder(writer, settings.path.absolute().parent, settings.reserve_bytes)
-    run = _Run(settings, cameras, clock, recorder, raw, stop, notify, show)
+    run = _Run(settings, stop, notify, show)
     try:
         while not run.over and (bus := connect(stop)) is not None:
-            try:
+            with closing(bus):
                 run.listen(bus)
-            finally:
-                bus.close()
     finally:
-        recorder.close()
-    if recorder.failure is not None:
-        raise recorder.failure
-    return recorder.progress()
+        run.recorder.close()
+    if run.recorder.failure is not None:
+        raise run.recorder.failure
+    return run.recorder.progress()
 
 
 class _Run:
@@ -224,16 +207,20 @@ class _Run:
     def __init__(
         self,
         settings: RecordSettings,
-        cameras: tuple[str, ...],
-        clock: MasterClock,
-        recorder: MessageRecorder,
-        raw: RawAsker,
         stop: threading.Event,
         notify: Callable[[str], None],
         show: Callable[[Progress, int], None],
     ) -> None:
-        self._settings, self._cameras, self._clock, self._recorder = settings, cameras, clock, recorder
-        self._raw, self._stop, self._notify, self._show = raw, stop, notify, show
+        self._settings, self._stop, self._notify, self._show = settings, stop, notify, show
+        setups, stem = settings.files.load(), settings.path.stem
+        self._cameras = tuple(dict.fromkeys(name for setup in setups for name in setup.camera_names))
+        self._clock = MasterClock()
+        self._raw = RawAsker(stem, self._cameras if settings.raw else (), notify, self._keep_health)
+        about = {"rigs": rigs_text(settings.files.rigs)}
+        if settings.raw:
+            about["raw"] = raw_text(stem, self._cameras)
+        writer = MessageWriter(settings.path, carried_files(settings.files, setups), about)
+        self.recorder = MessageRecorder(writer, settings.path.absolute().parent, settings.reserve_bytes)
         self._session = secrets.randbits(63)
         self._gone_lost = self._gone_dropped = 0
         self._lease: ProbeLease | None = None
@@ -241,17 +228,20 @@ class _Run:
         self._master: int | None = None
         self._reloads = 0
 
+    def _keep_health(self, health: Health) -> None:
+        self.recorder.offer("health", health, self._clock.now_ns())
+
     @property
     def over(self) -> bool:
         """Whether nothing more is to be recorded."""
         seconds = self._settings.seconds
-        full = seconds is not None and self._recorder.seconds >= seconds
-        return self._stop.is_set() or self._recorder.failure is not None or full
+        full = seconds is not None and self.recorder.seconds >= seconds
+        return self._stop.is_set() or self.recorder.failure is not None or full
 
     def listen(self, bus: Bus) -> None:
         """Record from one connection until it is over or the master gone or refuses."""
         with ExitStack() as stack:
-            self._subscriber = StreamSubscriber(bus, self._settings.streams, self._recorder, self._clock)
+            self._subscriber = StreamSubscriber(bus, self._settings.streams, self.recorder, self._clock)
             stack.callback(self._close_subscriber, self._subscriber)
             self._lease = ProbeLease(bus, self._subscriber, self._clock)
             bus.serve(NAME, self.answer)
@@ -272,7 +262,7 @@ class _Run:
 
     def health(self) -> Health:
         """Counts by stream, and `dropped` (no room), `lost` (never came); metrics."""
-        now = self._recorder.progress()
+        now = self.recorder.progress()
         counts = now.counts | {"dropped": self._dropped(now), "lost": self._lost()}
         metrics = {
             "recorder.seconds": round(now.seconds, 3),
@@ -309,14 +299,14 @@ class _Run:
             missed = 0
             self._look(health)
             bus.publish("health", NAME, self.health())
-            self._show(self._recorder.progress(), self._lost())
+            self._show(self.recorder.progress(), self._lost())
         if missed:
             self._notify("the master is gone; waiting for it")
 
     def _look(self, health: Health) -> None:
         """Print what the player of this file must know; record restarts of the master."""
         if health.session != self._master:
-            self._recorder.offer("health", health, self._clock.now_ns())
+            self._keep_health(health)
             if self._master is None:
                 self._notify(f"recording into {self._settings.path}")
             else:
@@ -366,18 +356,16 @@ def record(options: Namespace) -> None:
         if options.owned is None:
             line.show(progress_text(now, lost, options.seconds))
 
-    end = run_recorder(settings, lambda stop: _master_bus(options.bus, stop), stop, _recorder_status, show)
+    def waiting(_error: BusError) -> None:
+        _recorder_status(f"waiting for a master at {options.bus}")
+
+    end = run_recorder(
+        settings, lambda stop: bus_of_master(options.bus, stop, waiting), stop, _recorder_status, show
+    )
     dropped = sum(end.dropped.values())
     _recorder_status(
         f"recorded {end.seconds:.2f} s, {sum(end.counts.values())} messages, {dropped} dropped,"
         f" {end.written_bytes * 1e-6:.2f} MB in {options.file}"
-    )
-
-
-def _master_bus(endpoint: str, stop: threading.Event) -> Bus | None:
-    """The bus as the master sees it, once one listens; None: stopped before."""
-    return bus_of_master(
-        endpoint, stop, lambda _error: _recorder_status(f"waiting for a master at {endpoint}")
     )
 
 

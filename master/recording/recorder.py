@@ -1,10 +1,8 @@
 """The recorder writes messages to a file while slaves keep their raw frames.
 
-    threads of the bus ── offer ──▶ bounded queue ──▶ writer ──▶ file
-                            └ queue full: dropped, and counted by stream
-
-Whoever offers never waits for the disk. Where less than a reserve would be left of it, where it is full or
-gone, the recording ends with what was written, and `failure` states why.
+Whoever offers never waits for the disk (`Worker`); what its queue has no room for is counted by stream. Where
+less than a reserve would be left of the disk, where it is full or gone, the recording ends with what was
+written, and `failure` states why.
 
 Each camera's slave is asked for raw frames again and again, on a thread of its own: it goes on for as long as
 it is asked, so that a recorder that was killed, or lost its master, leaves ended recordings behind. A camera
@@ -12,7 +10,6 @@ that refuses is reported, and asked no more; the recording of messages goes on i
 """
 
 import json
-import queue
 import shutil
 import threading
 import time
@@ -24,8 +21,9 @@ from pathlib import Path
 from common.bus.bus import Bus
 from common.errors import BusError, CalibrationError, RecordingError
 from common.messages import Command, Health, Message, Preview, Still
-from common.messages.command_bodies import RawWish, raw_name, refuse_strange
+from common.messages.command_bodies import RawRequest, raw_name, refuse_strange
 from common.recording.messages import MessageWriter
+from master.outputs.worker import Worker
 
 _POLL_S = 0.25  # so often the disk is looked at, and what waits in a chunk given to it
 
@@ -64,31 +62,23 @@ class MessageRecorder:
             free_bytes: What is free on the disk of a folder.
         """
         self._writer, self._folder, self._reserve, self._free = writer, folder, reserve_bytes, free_bytes
-        self._waiting: queue.Queue[tuple[str, Message, int]] = queue.Queue(depth)
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._dropped: Counter[str] = Counter()
         self._counts: Counter[str] = Counter()
         self._first_ns: int | None = None
         self._last_ns = 0
         self._shown, self._bytes_per_s = (time.monotonic(), 0), 0.0
-        self._closing = threading.Event()
         self.failure: RecordingError | None = None
-        self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
-        self._thread.start()
+        self._worker = Worker[tuple[str, Message, int]]("recorder", self._work, depth)
+        self._worker.start()
 
     def offer(self, stream: str, message: Message, t_ns: int) -> None:
         """Take a message of any thread, or count it as dropped; never wait."""
-        # and no picture is taken where so many wait: they would fill the memory
-        pictures = isinstance(message, Preview | Still) and self._waiting.qsize() >= 100
-        if self.failure is None and not self._closing.is_set() and not pictures:
-            try:
-                self._waiting.put_nowait((stream, message, t_ns))
-            except queue.Full:
-                pass
-            else:
-                return
-        with self._lock:
-            self._dropped[stream] += 1
+        # no picture is taken where so many wait: they would fill the memory
+        refused = isinstance(message, Preview | Still) and self._worker.waiting >= 100
+        if refused or self.failure is not None or self._worker.offer((stream, message, t_ns)) is not None:
+            with self._lock:
+                self._dropped[stream] += 1
 
     @property
     def seconds(self) -> float:
@@ -109,45 +99,40 @@ class MessageRecorder:
             if now - before >= rate_s:  # several may ask; nobody shortens the time of another
                 self._shown, self._bytes_per_s = (now, written), (written - had) / (now - before)
             return Progress(
-                0.0 if self._first_ns is None else (self._last_ns - self._first_ns) * 1e-9,
+                self.seconds,
                 written,
                 self._bytes_per_s,
                 free,
-                self._waiting.qsize(),
+                self._worker.waiting,
                 dict(self._counts),
                 dict(self._dropped),
             )
 
     def close(self) -> None:
         """Write what waits and end the file, see `failure`. Safe to call twice."""
-        self._closing.set()
-        self._thread.join()
+        self._worker.close()
 
     def _work(self) -> None:
         looked = 0.0
-        while not (self._closing.is_set() and self._waiting.empty()):
-            try:
+        try:
+            while self._worker.waiting or not self._worker.closing:
                 if time.monotonic() - looked > _POLL_S:
                     looked = time.monotonic()
                     self._look()
-                self._write_next()
-            except RecordingError as error:
-                self.failure = error
-                break
+                if (offered := self._worker.take(_POLL_S)) is not None:
+                    self._write(*offered)
+                else:
+                    self._writer.flush()  # nothing comes: what is there need not wait for company
+        except RecordingError as error:
+            self.failure = error
         try:
             self._writer.close()
         except RecordingError as error:
             self.failure = error
         with self._lock:
-            while not self._waiting.empty():
-                self._dropped[self._waiting.get_nowait()[0]] += 1
+            self._dropped.update(stream for stream, _, _ in self._worker.clear())
 
-    def _write_next(self) -> None:
-        try:
-            stream, message, t_ns = self._waiting.get(timeout=_POLL_S)
-        except queue.Empty:
-            self._writer.flush()  # nothing comes: what is there need not wait for company
-            return
+    def _write(self, stream: str, message: Message, t_ns: int) -> None:
         with self._lock:
             self._counts[stream] += 1
             self._first_ns = t_ns if self._first_ns is None else self._first_ns
@@ -253,9 +238,9 @@ class RawAsker:
                 return
 
     def _ask(self, camera: _Camera, bus: Bus) -> None:
-        wish = RawWish(name=self._folder(camera), lease_s=LEASE_S)
+        request = RawRequest(name=self._folder(camera), lease_s=LEASE_S)
         try:
-            answer = bus.ask(Command(camera.name, "raw", wish.body()), _ASK_S)
+            answer = bus.ask(Command(camera.name, "raw", request.body()), _ASK_S)
         except BusError as error:
             camera.here = "refused" in str(error)  # one that refuses is there
             if camera.here:

@@ -83,24 +83,19 @@ def rigs_to_solve(
         raise RecordingError(
             f"{MANIFEST}: no rig to solve{f' of kind {only!r}' if only else ''}; it has {known}"
         )
-    if solver is not None:
-        if all(rig.kind != "markers" for rig in rigs):
-            raise CalibrationError(
-                f"--solver: rig {rigs[0].name!r} is of a wrist device; a rig of markers has solvers"
-            )
-        rigs = [msgspec.structs.replace(rig, solver=solver) if rig.kind == "markers" else rig for rig in rigs]
-    if solver_mode is None:
-        return rigs
-    if all(rig.kind != "wrist" for rig in rigs):
-        raise CalibrationError(
-            f"--solver-mode: rig {rigs[0].name!r} is of markers; a wrist device has levels"
-        )
-    return [
-        msgspec.structs.replace(rig, solver_mode=solver_mode) if rig.kind == "wrist" else rig for rig in rigs
-    ]
+    for option, value, kind, why in (
+        ("solver", solver, "markers", "of a wrist device; a rig of markers has solvers"),
+        ("solver_mode", solver_mode, "wrist", "of markers; a wrist device has levels"),
+    ):
+        if value is None:
+            continue
+        if all(rig.kind != kind for rig in rigs):
+            raise CalibrationError(f"--{option.replace('_', '-')}: rig {rigs[0].name!r} is {why}")
+        rigs = [msgspec.structs.replace(rig, **{option: value}) if rig.kind == kind else rig for rig in rigs]
+    return rigs
 
 
-def solve_hands(
+def solve(
     recording: FrameRecording,
     setups: Sequence[RigSetup],
     detections: Path,
@@ -133,9 +128,8 @@ def solve_hands(
         pipeline_of(setup, stage, continuous=continuous) for setup, stage in zip(setups, stages, strict=True)
     ]
     dispatcher = Dispatcher(setups, pipelines, stages[0], gestures=continuous)
-    counts = {setup.hand.profile.name: len(setup.markers) for setup in setups}
-    files = RunFiles(out / "poses.npz", counts, [one.name for setup in setups for one in setup.objects])
-    output = _Output({name: [] for name in counts})
+    files = RunFiles.of(out / "poses.npz", setups)
+    output = _Output({setup.hand.profile.name: [] for setup in setups})
     messages = _messages(recording, setups, detections)
     done = 0
     for message in heapq.merge(*(samples for samples, _ in sensed), messages, key=lambda one: one.t_ns):
@@ -161,17 +155,6 @@ def solve_hands(
         write_summary(path_of_hand(path, setup.hand.profile.name) if number else path, summary)
         summaries.append(summary)
     return summaries[0]
-
-
-def solve(
-    recording: FrameRecording,
-    setup: RigSetup,
-    detections: Path,
-    out: Path,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> dict[str, object]:
-    """As `solve_hands`, of one hand."""
-    return solve_hands(recording, [setup], detections, out, progress)
 
 
 @dataclass(slots=True)
@@ -201,7 +184,9 @@ def _object_scores(
     for one in setup.objects:
         truth = load_object_truth(recording.folder, one.name)
         if truth is not None:
-            scores[one.name] = score_object(ObjectPoses.of(one.name, poses.get(one.name, ())), truth)
+            scores[one.name] = score_object(
+                ObjectPoses.stacked(poses.get(one.name, ()), object=one.name), truth
+            )
     return scores
 
 
@@ -316,7 +301,7 @@ def replay_recording(options: Namespace, notify: Notify) -> None:
     recording = open_recording(folder)
     setups = setups_with_hands(rigs, manifest.cameras, options.calibration, options.hand, manifest.objects)
     found: Path = options.detections or out
-    solve_hands(recording, setups, found, out, lambda done, total: progress("solving", done, total))
+    solve(recording, setups, found, out, lambda done, total: progress("solving", done, total))
 
 
 def _detect(folder: Path, camera: str, kind: str, options: Namespace, notify: Notify) -> None:

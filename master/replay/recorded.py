@@ -4,16 +4,17 @@
 """
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace as with_fields
 from math import isfinite
 from pathlib import Path
-from typing import TypeVar
+from types import MappingProxyType
+from typing import Any, TypeVar
 
 import numpy as np
 from msgspec.structs import replace
 
-from common.arrays import Float, Int
+from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.errors import RecordingError
 from common.imu.csv_table import IMU, read_imu
@@ -35,25 +36,15 @@ def recorded_detections(folder: Path, camera: str, count: int) -> Iterator[Marke
     Raises:
         RecordingError: The file is missing or broken, or has another number of markers.
     """
-    path, fix = _file_of(folder, camera)
-    data = read_npz(path, ("t_ns", "seq", "uv", "area_px2", "quality"), fix, also=("sigma_px", "alt_uv"))
-    try:
-        t_ns, seq = (data[name].astype(np.int64, casting="same_kind") for name in ("t_ns", "seq"))
-        uv, area, quality = (data[name].astype(np.float64) for name in ("uv", "area_px2", "quality"))
-        sigma = data["sigma_px"].astype(np.float64) if "sigma_px" in data else _sigma_of(uv, quality)
-        alternative = data["alt_uv"].astype(np.float64) if "alt_uv" in data else np.full_like(uv, np.nan)
-    except (TypeError, ValueError) as error:
-        raise RecordingError(f"{path}: {error}: {fix}") from error
-    _check_times(path, t_ns, seq, fix)
-    if uv.shape != (len(t_ns), count, 2) or area.shape != uv.shape[:2] or quality.shape != uv.shape[:2]:
-        raise RecordingError(f"{path}: uv has shape {uv.shape}, the rig needs ({len(t_ns)}, {count}, 2)")
-    if sigma.shape != uv.shape[:2] or alternative.shape != uv.shape:
-        raise RecordingError(
-            f"{path}: sigma_px and alt_uv have shapes {sigma.shape} and {alternative.shape}, expected {uv.shape[:2]}"
-            f" and {uv.shape}: {fix}"
-        )
-    columns = {"uv": uv, "area": area, "quality": quality, "sigma_px": sigma, "alt_uv": alternative}
-    yield from _rows(MarkerDetections, path, fix, camera, t_ns, seq, columns)
+    path, row, pair = folder / f"detections_{camera}.npz", ("T", count), ("T", count, 2)
+    needed = {"seq": ("T",), "t_ns": ("T",), "uv": pair, "area_px2": row, "quality": row}
+    data = _read(path, camera, needed, {"sigma_px": row, "alt_uv": pair})
+    typical = {
+        "sigma_px": _sigma_of(data["uv"], data["quality"]),
+        "alt_uv": np.full_like(data["uv"], np.nan),
+        "area": data.pop("area_px2"),
+    }
+    yield from _rows(MarkerDetections, path, camera, typical | data)
 
 
 def recorded_cycles(folder: Path, camera: str) -> Iterator[WristDetections]:
@@ -62,65 +53,65 @@ def recorded_cycles(folder: Path, camera: str) -> Iterator[WristDetections]:
     Raises:
         RecordingError: The file is missing or broken.
     """
-    path, fix = _file_of(folder, camera)
-    also = ("seq", "laser_sigma_px", "laser_px", "tip_sigma_px", "tip_depth")
-    data = read_npz(path, ("t_ns", "laser_uv", "tip_uv"), fix, also=also)
-    try:
-        t_ns = data["t_ns"].astype(np.int64, casting="same_kind")
-        laser, tip = (data[name].astype(np.float64) for name in ("laser_uv", "tip_uv"))
-        # of a wrist device: some tenths of the line's width, and of a fingertip's
-        laser_px, tip_px = 0.5, 3.0
-        typical = {
-            "seq": CYCLE_FRAMES * np.arange(len(laser)),
-            "laser_sigma_px": _where_seen(laser, laser_px),
-            "laser_px": np.full(laser.shape[:2], np.nan),
-            "tip_sigma_px": _where_seen(tip, tip_px),
-            "tip_depth": np.full(tip.shape[:2], np.nan),
-        }
-        rest = {name: data[name] if name in data else typical[name] for name in also}
-        seq = rest.pop("seq").astype(np.int64, casting="same_kind")
-        each = {name: array.astype(np.float64) for name, array in rest.items()}
-    except (TypeError, ValueError, IndexError) as error:
-        raise RecordingError(f"{path}: {error}: {fix}") from error
-    _check_times(path, t_ns, seq, fix)
-    for name, array, shape in (
-        ("laser_uv", laser, (len(t_ns), FINGER_COUNT, 2)),
-        ("tip_uv", tip, (len(t_ns), FINGER_COUNT, 2)),
-        *((name, array, (len(t_ns), FINGER_COUNT)) for name, array in each.items()),
-    ):
-        if array.shape != shape:
-            raise RecordingError(f"{path}: {name} has shape {array.shape}, expected {shape}: {fix}")
-    columns = {"laser_uv": laser, "tip_uv": tip, **each}
-    yield from _rows(WristDetections, path, fix, camera, t_ns, seq, columns)
+    path, row, pair = folder / f"detections_{camera}.npz", ("T", FINGER_COUNT), ("T", FINGER_COUNT, 2)
+    each = dict.fromkeys(("laser_sigma_px", "laser_px", "tip_sigma_px", "tip_depth"), row)
+    needed = {"t_ns": ("T",), "laser_uv": pair, "tip_uv": pair}
+    data = _read(path, camera, needed, {"seq": ("T",), **each})
+    unknown = np.full(data["laser_uv"].shape[:2], np.nan)
+    laser_px, tip_px = 0.5, 3.0  # of a wrist device: some tenths of the line's width, and of a fingertip's
+    typical = {
+        "seq": CYCLE_FRAMES * np.arange(len(data["t_ns"])),
+        "laser_sigma_px": _where_seen(data["laser_uv"], laser_px),
+        "laser_px": unknown,
+        "tip_sigma_px": _where_seen(data["tip_uv"], tip_px),
+        "tip_depth": unknown,
+    }
+    yield from _rows(WristDetections, path, camera, typical | data)
+
+
+_WHOLE = ("t_ns", "seq", "ids", "row")  # arrays of whole numbers
+
+
+def _fix(camera: str) -> str:
+    return f"run `phalanx-slave run -o` for camera {camera!r} first"
+
+
+def _read(
+    path: Path,
+    camera: str,
+    needed: Mapping[str, Sequence[int | str]],
+    also: Mapping[str, Sequence[int | str]] = MappingProxyType({}),
+) -> dict[str, Any]:
+    """Arrays by name; a letter in a shape is one number throughout."""
+    data, sizes = read_npz(path, list(needed), _fix(camera), also=also), dict[str, int]()
+    for name, array in data.items():
+        whole, shape = name in _WHOLE, (needed.get(name) or also[name])
+        try:
+            kind: Any = np.int64 if whole else np.float64
+            data[name] = array.astype(kind, casting="same_kind" if whole else "unsafe")
+        except (TypeError, ValueError) as error:
+            raise RecordingError(f"{path}: {name}: {error}: {_fix(camera)}") from error
+        for letter, size in zip(shape, array.shape, strict=False):
+            if isinstance(letter, str):
+                sizes.setdefault(letter, size)
+        expected = tuple(sizes.get(size, -1) if isinstance(size, str) else size for size in shape)
+        if array.shape != expected:
+            raise RecordingError(
+                f"{path}: {name} has shape {array.shape}, expected {expected}: {_fix(camera)}"
+            )
+    return data
 
 
 def _rows(
-    message: Callable[..., DetectionsT],
-    path: Path,
-    fix: str,
-    camera: str,
-    t_ns: Int,
-    seq: Int,
-    columns: Mapping[str, Float],
+    message: Callable[..., DetectionsT], path: Path, camera: str, columns: Mapping[str, Any]
 ) -> Iterator[DetectionsT]:
     """The message of each row of these columns."""
-    for row, (time_ns, number) in enumerate(zip(t_ns.tolist(), seq.tolist(), strict=True)):
-        values = {name: array[row] for name, array in columns.items()}
+    for row in range(len(columns["t_ns"])):
+        values = {name: int(array[row]) if name in _WHOLE else array[row] for name, array in columns.items()}
         try:
-            yield message(camera=camera, session=0, seq=number, t_ns=time_ns, ready_t_ns=time_ns, **values)
+            yield message(camera=camera, session=0, ready_t_ns=values["t_ns"], **values)
         except ValueError as error:
-            raise RecordingError(f"{path}: row {row}: {error}: {fix}") from error
-
-
-def _file_of(folder: Path, camera: str) -> tuple[Path, str]:
-    return folder / f"detections_{camera}.npz", f"run `phalanx-slave run -o` for camera {camera!r} first"
-
-
-def _check_times(path: Path, t_ns: Int, seq: Int, fix: str) -> None:
-    if t_ns.ndim != 1 or seq.shape != t_ns.shape:
-        raise RecordingError(
-            f"{path}: t_ns and seq have shapes {t_ns.shape} and {seq.shape}, expected one (T,): {fix}"
-        )
+            raise RecordingError(f"{path}: row {row}: {error}: {_fix(camera)}") from error
 
 
 def _where_seen(uv: Float, value: float) -> Float:
@@ -192,9 +183,6 @@ def _with_imu(setup: RigSetup, imu: ImuCalibration) -> RigSetup:
     return with_fields(setup, rig=rig, wrist=with_fields(setup.wrist, imu=imu), wrist_rig=wrist_rig)
 
 
-_ARRAYS = ("t_ns", "seq", "ids", "uv", "sigma_px", "row")
-
-
 def recorded_tags(folder: Path, camera: str) -> Iterator[TagDetections]:
     """The searched frames of tags_<camera>.npz.
 
@@ -204,26 +192,19 @@ def recorded_tags(folder: Path, camera: str) -> Iterator[TagDetections]:
     Raises:
         RecordingError: The file is missing or broken.
     """
-    path, fix = folder / f"tags_{camera}.npz", f"run `phalanx-slave run -o` for camera {camera!r} first"
-    data = read_npz(path, _ARRAYS, fix)
-    try:
-        t_ns, seq, row, ids = (
-            data[name].astype(np.int64, casting="same_kind") for name in ("t_ns", "seq", "row", "ids")
-        )
-        uv, sigma = (data[name].astype(np.float64) for name in ("uv", "sigma_px"))
-    except (TypeError, ValueError) as error:
-        raise RecordingError(f"{path}: {error}: {fix}") from error
-    tags = len(ids) if ids.ndim == 1 else -1
-    for name, array, shape in (
-        ("t_ns", t_ns, (len(seq) if seq.ndim == 1 else -1,)),
-        ("uv", uv, (tags, 4, 2)),
-        ("sigma_px", sigma, (tags,)),
-        ("row", row, (tags,)),
-    ):
-        if array.shape != shape:
-            raise RecordingError(f"{path}: {name} has shape {array.shape}, expected {shape}: {fix}")
+    path = folder / f"tags_{camera}.npz"
+    needed = {
+        "seq": ("T",),
+        "t_ns": ("T",),
+        "ids": ("N",),
+        "uv": ("N", 4, 2),
+        "sigma_px": ("N",),
+        "row": ("N",),
+    }
+    data = _read(path, camera, needed)
+    t_ns, ids, row = data["t_ns"], data["ids"], data["row"]
     if ((row < 0) | (row >= len(t_ns))).any() or ((ids < 0) | (ids > 65535)).any():
-        raise RecordingError(f"{path}: row or ids: out of range: {fix}")
+        raise RecordingError(f"{path}: row or ids: out of range: {_fix(camera)}")
     for frame in range(len(t_ns)):
         own = np.flatnonzero(row == frame)
         own = own[np.argsort(ids[own], kind="stable")]
@@ -231,12 +212,12 @@ def recorded_tags(folder: Path, camera: str) -> Iterator[TagDetections]:
             yield TagDetections(
                 camera=camera,
                 session=0,
-                seq=int(seq[frame]),
+                seq=int(data["seq"][frame]),
                 t_ns=int(t_ns[frame]),
                 ready_t_ns=int(t_ns[frame]),
                 ids=ids[own].astype(np.uint16),
-                uv=uv[own],
-                sigma_px=sigma[own],
+                uv=data["uv"][own],
+                sigma_px=data["sigma_px"][own],
             )
         except ValueError as error:
-            raise RecordingError(f"{path}: frame {frame}: {error}: {fix}") from error
+            raise RecordingError(f"{path}: frame {frame}: {error}: {_fix(camera)}") from error

@@ -8,15 +8,15 @@ tracked as well as the cameras see it, but how well is unknown: that a joint lie
 invalid.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from msgspec.structs import replace
 
 from common.arrays import Bool, Float
-from common.calibration import ImuCalibration, Provenance, RigCalibration, Volume, load
-from common.calibration.files import Matrix4, Row4, Vector3
+from common.calibration import RigCalibration, Volume, load
+from common.calibration.files import Matrix4, Row4
 from common.calibration.gesture_settings import GestureSettings, default_gestures
 from common.calibration.object_profile import ObjectProfile
 from common.calibration.rig import check_places
@@ -50,6 +50,8 @@ def merged_rig(rigs: Sequence[RigCalibration]) -> RigCalibration:
                 raise CalibrationError(
                     f"rigs {first.name!r} and {rig.name!r}: {key}: differ, and both watch hand {first.hand!r}"
                 )
+    key = "T_rig_camera"
+    known = [rig.provenance[key] for rig in placed if key in rig.provenance]
     merged = replace(
         first,
         name="_and_".join(rig.name for rig in placed),
@@ -58,7 +60,7 @@ def merged_rig(rigs: Sequence[RigCalibration]) -> RigCalibration:
         T_rig_camera={name: pose for rig in placed for name, pose in rig.T_rig_camera.items()},
         stamp_offset_us={name: us for rig in placed for name, us in rig.stamp_offset_us.items()},
         volume=next((rig.volume for rig in placed if rig.volume is not None), None),
-        provenance=_worst_places(placed),
+        provenance={} if not known else {key: max(known, key=lambda one: one.residual.get("rms_px", 0.0))},
         imu=next((rig.imu for rig in placed if rig.imu is not None), None),
         objects=tuple(dict.fromkeys(name for rig in placed for name in rig.objects)),
         T_rig_tracking=next((rig.T_rig_tracking for rig in placed if rig.T_rig_tracking is not None), None),
@@ -89,15 +91,22 @@ def refuse_shared_senders(rigs: Sequence[RigCalibration]) -> None:
     Raises:
         CalibrationError: With both rigs and the name.
     """
-    owner: dict[str, RigCalibration] = {}
-    for rig in rigs:
-        for sender in (*rig.cameras, *(() if rig.imu is None else (rig.imu.name,))):
-            if sender in owner:
-                raise CalibrationError(
-                    f"rigs {owner[sender].name!r} and {rig.name!r} both have {sender!r}: every camera and every IMU"
-                    " has a name of its own"
-                )
-            owner[sender] = rig
+    senders = [
+        (rig.name, repr(sender))
+        for rig in rigs
+        for sender in (*rig.cameras, *(() if rig.imu is None else (rig.imu.name,)))
+    ]
+    _refuse_shared("rigs", senders, "every camera and every IMU has a name of its own")
+
+
+def _refuse_shared(owners: str, owned: Iterable[tuple[str, str]], remedy: str = "") -> None:
+    """Refuse what two owners have, by a CalibrationError that names both."""
+    owner: dict[str, str] = {}
+    for name, what in owned:
+        if what in owner:
+            text = f"{owners} {owner[what]!r} and {name!r} both have {what}"
+            raise CalibrationError(f"{text}: {remedy}" if remedy else text)
+        owner[what] = name
 
 
 def rigs_by_hand(
@@ -150,39 +159,20 @@ def in_world(rig: RigCalibration) -> RigCalibration:
     if rig.T_world_rig is None:
         return rig
     T_world_rig = np.array(rig.T_world_rig)
-    poses = {name: _matrix(T_world_rig @ rig.camera_pose(name)) for name in rig.T_rig_camera}
-    return replace(
-        rig,
-        T_world_rig=None,
-        T_rig_camera=poses,
-        imu=_imu(rig.imu, T_world_rig),
-        volume=_volume(rig.volume, T_world_rig),
-        T_rig_tracking=None
-        if rig.T_rig_tracking is None
-        else _matrix(T_world_rig @ np.array(rig.T_rig_tracking)),
-    )
-
-
-def _imu(imu: ImuCalibration | None, T_world_rig: Float) -> ImuCalibration | None:
-    if imu is None or imu.q_rig_world is None:
-        return imu
-    rotated = matrix_to_quaternion(T_world_rig[:3, :3] @ quaternion_to_matrix(np.array(imu.q_rig_world)))
-    return replace(imu, q_rig_world=_row(rotated))
-
-
-def _volume(volume: Volume | None, T_world_rig: Float) -> Volume | None:
+    imu, volume, tracking = rig.imu, rig.volume, rig.T_rig_tracking
+    if imu is not None and imu.q_rig_world is not None:
+        rotation = T_world_rig[:3, :3] @ quaternion_to_matrix(np.array(imu.q_rig_world))
+        imu = replace(imu, q_rig_world=_row(matrix_to_quaternion(rotation)))
     unturned = 1e-9  # of a rotation matrix that turns nothing
-    if volume is None or not np.allclose(T_world_rig[:3, :3], np.eye(3), rtol=0.0, atol=unturned):
-        return None
-    low, high = transform(T_world_rig, np.array([volume.low_m, volume.high_m]))
-    return Volume(low_m=_vector(low), high_m=_vector(high))
-
-
-def _worst_places(rigs: Sequence[RigCalibration]) -> dict[str, Provenance]:
-    """Return the cameras' provenance of the rig whose cameras are placed worst."""
-    key = "T_rig_camera"
-    known = [rig.provenance[key] for rig in rigs if key in rig.provenance]
-    return {} if not known else {key: max(known, key=lambda one: one.residual.get("rms_px", 0.0))}
+    if not np.allclose(T_world_rig[:3, :3], np.eye(3), rtol=0.0, atol=unturned):
+        volume = None
+    if volume is not None:
+        low, high = transform(T_world_rig, np.array([volume.low_m, volume.high_m])).tolist()
+        volume = Volume(low_m=(low[0], low[1], low[2]), high_m=(high[0], high[1], high[2]))
+    if tracking is not None:
+        tracking = _matrix(T_world_rig @ np.array(tracking))
+    poses = {name: _matrix(T_world_rig @ rig.camera_pose(name)) for name in rig.T_rig_camera}
+    return replace(rig, T_world_rig=None, T_rig_camera=poses, imu=imu, volume=volume, T_rig_tracking=tracking)
 
 
 def _matrix(pose: Float) -> Matrix4:
@@ -191,16 +181,8 @@ def _matrix(pose: Float) -> Matrix4:
 
 
 def _row(row: Float) -> Row4:
-    a, b, c, d = (float(value) for value in row)
+    a, b, c, d = row.tolist()
     return a, b, c, d
-
-
-def _vector(point: Float) -> Vector3:
-    x, y, z = (float(value) for value in point)
-    return x, y, z
-
-
-DEFAULT_GESTURES = "default"
 
 
 def objects_of(rig: RigCalibration, objects: Mapping[str, ObjectProfile]) -> tuple[ObjectProfile, ...]:
@@ -225,23 +207,15 @@ def objects_of(rig: RigCalibration, objects: Mapping[str, ObjectProfile]) -> tup
                     f"rig {rig.name!r}: free_markers: {bead!r} is missing, a marker of object {name!r}"
                 )
         found.append(one)
-    _refuse_shared_features(rig.name, found)
+    features: list[tuple[str, str]] = []
+    for one in found:
+        features += [(one.name, f"marker {bead!r}") for bead in one.markers]
+        if one.tags is not None:
+            features += [(one.name, f"tag {tag.id} of {one.tags.family}") for tag in one.tags.tags]
+        if one.tracker is not None:
+            features.append((one.name, f"tracker {one.tracker!r}"))
+    _refuse_shared(f"rig {rig.name!r}: objects", features)
     return tuple(found)
-
-
-def _refuse_shared_features(rig: str, objects: Sequence[ObjectProfile]) -> None:
-    owner: dict[str, str] = {}
-    for one in objects:
-        tags = (
-            () if one.tags is None else tuple(f"tag {tag.id} of {one.tags.family}" for tag in one.tags.tags)
-        )
-        tracker = () if one.tracker is None else (f"tracker {one.tracker!r}",)
-        for feature in (*(f"marker {bead!r}" for bead in one.markers), *tags, *tracker):
-            if feature in owner:
-                raise CalibrationError(
-                    f"rig {rig!r}: objects {owner[feature]!r} and {one.name!r} both have {feature}"
-                )
-            owner[feature] = one.name
 
 
 def refuse_shared_objects(watched: Sequence[tuple[str, Sequence[ObjectProfile]]]) -> None:
@@ -252,18 +226,13 @@ def refuse_shared_objects(watched: Sequence[tuple[str, Sequence[ObjectProfile]]]
     Raises:
         CalibrationError: With both rigs and the object.
     """
-    owner: dict[str, str] = {}
+    owned: list[tuple[str, str]] = []
     for rig, objects in watched:
         for one in objects:
-            for what in (
-                f"object {one.name!r}",
-                *(() if one.tracker is None else (f"tracker {one.tracker!r}",)),
-            ):
-                if what in owner:
-                    raise CalibrationError(
-                        f"rigs {owner[what]!r} and {rig!r} both have {what}: objects: let one of them have it"
-                    )
-                owner[what] = rig
+            owned.append((rig, f"object {one.name!r}"))
+            if one.tracker is not None:
+                owned.append((rig, f"tracker {one.tracker!r}"))
+    _refuse_shared("rigs", owned, "objects: let one of them have it")
 
 
 def load_objects(
@@ -306,7 +275,7 @@ def load_gestures(calibration: Path | None, name: str | None) -> GestureSettings
 
 def gestures_file(calibration: Path, name: str | None) -> Path:
     """The file of a rig's gestures; `name` None: default.json."""
-    return calibration / "gestures" / f"{name or DEFAULT_GESTURES}.json"
+    return calibration / "gestures" / f"{name or 'default'}.json"
 
 
 _EDGES = tuple((a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1)

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from math import hypot, nan, sqrt
 from typing import Protocol, cast
 
@@ -12,20 +13,19 @@ from common.errors import CalibrationError
 from common.geometry.transforms import cross
 from common.kernels import log_if_slow
 from common.messages import Detections
-from master.estimator.epoch import CycleReader
 from master.estimator.estimator import Estimator
-from master.estimator.pipeline import MarkerPipeline, SolvedPose, Stage
-from master.estimator.priors import CubicLaw, WristModel, loosened
+from master.estimator.pipeline import MarkerPipeline, SolvedPose
+from master.estimator.priors import WristModel, loosened
 from master.estimator.sensors import CameraArrays
 from master.estimator.settings import Settings
 from master.estimator.smoothing import HandOneEuro
-from master.estimator.wrist_pipeline import FusedPipeline, WristPipeline, WristSide
+from master.estimator.wrist_pipeline import WristPipeline, WristSide
 from master.fabrik.caps import CapTables
 from master.fabrik.depth import LAW_RESIDUAL, CalibrationResidual, depth_law, law_contradicts, law_residual
 from master.fabrik.intersection import RAYS, limits_of, rehearse
 from master.fabrik.one_euro import OneEuroParameters, PointFilter
 from master.fabrik.rays import RayTriangulator
-from master.fabrik.solver import FabrikSolver
+from master.fabrik.solver import FabrikSolver, Stage
 from master.fabrik.sync import FrameSync
 from master.fabrik.triangulate import DepthTriangulator, disparity_tables
 from master.rig.setup import RigSetup
@@ -146,7 +146,7 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
         one_euro=_point_filter(setup) if continuous else None,
         palm=_estimator(setup, continuous=continuous, natural=True),
         once=_estimator(
-            setup, continuous=False, natural=True, settings=setup.settings._replace(curled_rad=any_curl_rad)
+            setup, continuous=False, natural=True, settings=replace(setup.settings, curled_rad=any_curl_rad)
         ),
         stage=stage,
     )
@@ -197,6 +197,7 @@ def build_pipeline(
             volume=rig.volume,
             imu=rig.imu if side is None else None,
             side=side,
+            slowest_hz=min(setup.cameras[name].frame_rate_hz for name in setup.models),
             counts=counts,
             stage=stage,
             dropped_epochs=dropped_epochs,
@@ -216,20 +217,13 @@ def pipeline_of(
     do.
     """
     if setup.wrist is None:
-        return cast(
-            Pipeline, build_pipeline(setup, stage, continuous=continuous, dropped_epochs=dropped_epochs)
-        )
+        return build_pipeline(setup, stage, continuous=continuous, dropped_epochs=dropped_epochs)
     try:
         if setup.has_markers:
             counts = Counter[str]()
-            cubic = CubicLaw(setup.wrist) if setup.wrist.cubic else None
-            reader = CycleReader(setup.wrist, cubic, counts)
-            side = WristSide(setup.wrist, reader, counts, continuous=continuous)
-            markers = build_pipeline(
+            side = WristSide(setup.wrist, counts, continuous=continuous)
+            return build_pipeline(
                 setup, stage, continuous=continuous, side=side, counts=counts, dropped_epochs=dropped_epochs
-            )
-            return FusedPipeline(
-                markers, side, min(setup.cameras[name].frame_rate_hz for name in setup.models)
             )
         return cast(
             Pipeline, WristPipeline(setup.wrist, continuous=continuous, stage=stage, settings=setup.settings)

@@ -166,7 +166,7 @@ class RigSetup:
         marked = [setup for setup in setups if setup.has_markers]
         wrist_setups = [setup for setup in setups if not setup.has_markers]
         rigs = [setup.rig for setup in setups]
-        _refuse_two(setups, wrist_setups)
+        _refuse_two(setups)
         refuse_shared_senders(rigs)
         gestures_named(rigs)
         if not marked:
@@ -175,17 +175,13 @@ class RigSetup:
         objects = {one.name: one for setup in marked for one in setup.objects}
         merged = merged_rig([setup.rig for setup in marked])
         out = cls.of(merged, cameras, setups[0].hand, objects or None)
-        out = with_fields(out, gestures=_gestures(setups))
+        named = (setup.gestures for setup in setups if setup.rig.gestures is not None)
         rows = {name: which for setup in marked for name, which in setup.rows.items()}
-        if not wrist_setups:
-            return with_fields(out, rows=rows)
-        return with_fields(
-            out,
-            cameras=cameras | wrist_setups[0].cameras,
-            wrist=wrist_setups[0].wrist,
-            wrist_rig=wrist_setups[0].rig,
-            rows=rows,
-        )
+        out = with_fields(out, gestures=next(named, setups[0].gestures), rows=rows)
+        for device in wrist_setups:  # one, or none
+            cameras |= device.cameras
+            out = with_fields(out, cameras=cameras, wrist=device.wrist, wrist_rig=device.rig)
+        return out
 
 
 def _check_mounts(rig: RigCalibration, hand: HandModel) -> None:
@@ -200,12 +196,8 @@ def _check_mounts(rig: RigCalibration, hand: HandModel) -> None:
                 ) from error
 
 
-def _gestures(setups: Sequence[RigSetup]) -> GestureSettings:
-    named = (setup.gestures for setup in setups if setup.rig.gestures is not None)
-    return next(named, setups[0].gestures)
-
-
-def _refuse_two(setups: Sequence[RigSetup], wrist_setups: Sequence[RigSetup]) -> None:
+def _refuse_two(setups: Sequence[RigSetup]) -> None:
+    """Refuse rigs of two hands, with two wrist devices or with two IMUs."""
     first = setups[0]
     for setup in setups:
         if setup.hand.profile != first.hand.profile:
@@ -213,9 +205,10 @@ def _refuse_two(setups: Sequence[RigSetup], wrist_setups: Sequence[RigSetup]) ->
                 f"rigs {first.rig.name!r} and {setup.rig.name!r} are of different hands,"
                 f" {first.hand.profile.name!r} and {setup.hand.profile.name!r}"
             )
-    if len(wrist_setups) > 1:
+    worn = [setup.rig.name for setup in setups if not setup.has_markers]
+    if len(worn) > 1:
         raise CalibrationError(
-            f"rigs {wrist_setups[0].rig.name!r} and {wrist_setups[1].rig.name!r} are both of kind 'wrist' and of hand"
+            f"rigs {worn[0]!r} and {worn[1]!r} are both of kind 'wrist' and of hand"
             f" {first.hand.profile.name!r}: a hand wears one wrist device"
         )
     sensed = [setup.rig.name for setup in setups if setup.rig.imu is not None]
@@ -355,18 +348,12 @@ class RigFiles:
 
     def paths(self, setups: Sequence[RigSetup]) -> tuple[Path, ...]:
         """All files that `setups` were read from."""
-        rigs = [self.calibration / "rigs" / f"{name}.json" for name in self.rigs]
-        cameras = [
-            self.calibration / "cameras" / f"{name}.json" for setup in setups for name in setup.camera_names
-        ]
-        hands = [self.hand or self.calibration / "hands" / f"{setup.rig.hand}.json" for setup in setups]
-        objects = [
-            self.calibration / "objects" / f"{one.name}.json" for setup in setups for one in setup.objects
-        ]
-        gestures = [
-            gestures_file(self.calibration, rig.gestures)
-            for setup in setups
-            for rig in (setup.rig, setup.wrist_rig)
-            if rig is not None
-        ]
-        return tuple(dict.fromkeys([*rigs, *cameras, *hands, *objects, *gestures]))
+        tree = self.calibration
+        paths = [tree / "rigs" / f"{name}.json" for name in self.rigs]
+        for setup in setups:
+            paths += [tree / "cameras" / f"{name}.json" for name in setup.camera_names]
+            paths.append(self.hand or tree / "hands" / f"{setup.rig.hand}.json")
+            paths += [tree / "objects" / f"{one.name}.json" for one in setup.objects]
+            rigs = (setup.rig, setup.wrist_rig)
+            paths += [gestures_file(tree, rig.gestures) for rig in rigs if rig is not None]
+        return tuple(dict.fromkeys(paths))

@@ -7,7 +7,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Generic, TypeAlias, TypeVar
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 
@@ -87,32 +87,30 @@ class RunFigures:
         out = {"poses": float(self.poses)}
         if self.poses > 1 and span_s > 0:
             out["poses_per_s"] = round((self.poses - 1) / span_s, 2)
-        if self.poses:
-            p50, p99 = np.percentile(self._latency_ms[: self.poses], [50, 99])
-            out |= {"latency_p50_ms": round(float(p50), 3), "latency_p99_ms": round(float(p99), 3)}
-        if tracked := self.published["objects"]:
-            p50, p99 = np.percentile(self._object_ms[:tracked], [50, 99])
-            out |= {
-                "object_latency_p50_ms": round(float(p50), 3),
-                "object_latency_p99_ms": round(float(p99), 3),
-            }
+        for of, ring, count in (
+            ("latency", self._latency_ms, self.poses),
+            ("object_latency", self._object_ms, self.published["objects"]),
+        ):
+            if count:
+                p50, p99 = np.percentile(ring[:count], [50, 99])
+                out |= {f"{of}_p50_ms": round(float(p50), 3), f"{of}_p99_ms": round(float(p99), 3)}
         return out
 
 
-class Observed(Generic[SeenT]):
-    """A solver with camera rates counted before it, and `monitor` called after it."""
+def observed(
+    solve: Solve[SeenT], rates: CameraRates, monitor: Callable[[SeenT], None]
+) -> Callable[[SeenT | AuxiliaryMessage], Iterator[Solved]]:
+    """Return a solver with camera rates counted before, `monitor` called after."""
 
-    def __init__(self, solve: Solve[SeenT], rates: CameraRates, monitor: Callable[[SeenT], None]) -> None:
-        self._solve, self._rates, self._monitor = solve, rates, monitor
-
-    def push(self, message: SeenT | AuxiliaryMessage) -> Iterator[Solved]:
-        """Take one message; give what it completes."""
+    def push(message: SeenT | AuxiliaryMessage) -> Iterator[Solved]:
         if isinstance(message, _AUXILIARY):
-            yield from self._solve(message)
+            yield from solve(message)
             return
-        self._rates.push(message)
-        yield from self._solve(message)
-        self._monitor(message)
+        rates.push(message)
+        yield from solve(message)
+        monitor(message)
+
+    return push
 
 
 def run(

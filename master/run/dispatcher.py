@@ -26,7 +26,8 @@ from common.messages import (
     TrackerPose,
     WristDetections,
 )
-from master.estimator.pipeline import SolvedPose, Stage
+from master.estimator.pipeline import SolvedPose
+from master.fabrik.solver import Stage
 from master.gestures.poses import GestureRecogniser
 from master.objects.contact import ContactMonitor
 from master.objects.line import ObjectLine, SolvedObject

@@ -10,7 +10,6 @@ import os
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
 from ipaddress import AddressValueError, IPv4Address
 from types import MappingProxyType
 from typing import NamedTuple
@@ -229,8 +228,7 @@ class Ingest:
     def counts(self) -> dict[str, int]:
         """Event -> how often, as `Health.counts` wants it.
 
-        <sender>.<event>, refused.<reason>, fault.<sender>, queue.*; of tags <camera>.tags_received and
-        <camera>.tags_late, once there were any.
+        <sender>.<event> of `MasterLink.events_of`, refused.<reason>, fault.<sender>, queue.*.
         """
         counts = {
             "queue.dropped": self.queue.overflowed,
@@ -239,15 +237,9 @@ class Ingest:
             "unsynchronised": self._link.unsynchronised,
         }
         for sender in self._senders:
-            of = asdict(self.counts_of(sender))
-            counts |= {f"{sender}.{event}": number for event, number in of.items()}
             with self._lock:
-                counts[f"{sender}.clock_steps"] = self._link.clock_steps_of(sender)
-                counts[f"{sender}.restarts"] = self._link.restarts_of(sender)
-                counts[f"{sender}.refused"] = self._link.refused_of(sender)
-                tags = self._link.tag_counts_of(sender)
-            if tags is not None and tags.received:
-                counts |= {f"{sender}.tags_received": tags.received, f"{sender}.tags_late": tags.late}
+                events = self._link.events_of(sender)
+            counts |= {f"{sender}.{event}": number for event, number in events.items()}
         counts |= {f"fault.{sender}": n for sender, n in dict(self.quarantine.faults).items()}
         return counts | {f"refused.{reason}": n for reason, n in self.refused.items()}
 
@@ -274,8 +266,8 @@ class Ingest:
         """
         t_ns = self._clock.now_ns()
         with self._lock:
-            rejected = self._link.rejected_peers
-            return rejected.duplicates(t_ns), rejected.versions(t_ns), rejected.secrets(t_ns)
+            lately = self._link.rejected_peers.lately
+            return lately("duplicate", t_ns), lately("version", t_ns), lately("unproven", t_ns)
 
     def marker_counts(self) -> dict[str, MarkerCounts]:
         """Camera -> how many markers it sent and its rig has, where these differ."""

@@ -21,7 +21,7 @@ classifies datagrams as events.
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from types import MappingProxyType
 
 from common.clock import Clock
@@ -62,7 +62,9 @@ from common.messages import (
 from common.messages.streams import sender_of
 from master.run.link_senders import (
     ASKED,
+    MarkerCounts,
     Quarantine,
+    RejectedPeer,
     RejectedPeers,
     Sender,
     SenderLimits,
@@ -116,11 +118,8 @@ class MasterLink:
                 raise ValueError(f"{min(both)!r} is {one} and {other}")
         if strange := set(wrists) - set(cameras):
             raise ValueError(f"{min(strange)!r} of a wrist device is none of the cameras")
-        self._keys = RigKeys(key)
-        self._clock = clock
-        self._random = random
-        self._beacon_to = beacon_to
-        self._zenoh_endpoint = zenoh_endpoint
+        self._keys, self._clock, self._random = RigKeys(key), clock, random
+        self._beacon_to, self._zenoh_endpoint = beacon_to, zenoh_endpoint
         self._start_timeout_ns = start_timeout_ns
         self._nonce = random(NONCE_BYTES)
         self._sealer = self._keys.sealer(new_process_id(random(8)))
@@ -135,10 +134,8 @@ class MasterLink:
             for names, steps in kinds
             for name in names
         }
-        self._awaited, self._extra = (
-            tuple(self._senders[name] for name in cameras),
-            frozenset((*imus, *trackers)),
-        )
+        self._awaited = tuple(self._senders[name] for name in cameras)
+        self._extra = frozenset((*imus, *trackers))
         self._sessions: dict[int, Session] = {}
         self._first_ns: int | None = None
         self._start_ns: int | None = None
@@ -173,7 +170,10 @@ class MasterLink:
         if t_ns >= self._next_beacon_ns:
             beacon_ns = 100_000_000
             self._next_beacon_ns = max(self._next_beacon_ns + beacon_ns, t_ns)
-            self._outbox.append((seal(self._sealer, self._beacon()), self._beacon_to))
+            live = {name: sender.live for name, sender in self._senders.items()}
+            known = {name: session.key_id for name, session in live.items() if session is not None}
+            beacon = Beacon(self._nonce, self._zenoh_endpoint, known)
+            self._outbox.append((seal(self._sealer, beacon), self._beacon_to))
         for sender in self._senders.values():
             pending = sender.pending
             if pending is not None and t_ns - pending.since_ns > PENDING_NS:
@@ -214,23 +214,24 @@ class MasterLink:
         live = self._senders[sender].live
         return None if live is None else live.clock.estimate()
 
-    def clock_steps_of(self, sender: str) -> int:
-        """Return how often the clock of `sender` has jumped since this master began."""
-        of = self._senders[sender]
-        return of.steps_before + (0 if of.live is None else of.live.clock.steps)
-
-    def restarts_of(self, sender: str) -> int:
-        """Return how often another process took over as `sender`."""
-        return self._senders[sender].restarts
-
     def limit(self, limits: Mapping[str, SenderLimits]) -> None:
         """Accept from each sender what its files state now."""
         for name, sender in self._senders.items():
             sender.limit(limits.get(name, SenderLimits()))
 
-    def refused_of(self, sender: str) -> int:
-        """Return how many datagrams were refused that `sender` sealed in its sessions."""
-        return self._senders[sender].refused
+    def events_of(self, sender: str) -> dict[str, int]:
+        """Return event -> how often since this master began.
+
+        Those of `CameraCounts`; clock_steps, how often its clock has jumped; restarts, how often another process took
+        over; refused, datagrams that it sealed; once there were any, tags_received and tags_late.
+        """
+        of, tags = self._senders[sender], self.tag_counts_of(sender)
+        steps = of.steps_before + (0 if of.live is None else of.live.clock.steps)
+        events = asdict(self.counts_of(sender))
+        events |= {"clock_steps": steps, "restarts": of.restarts, "refused": of.refused}
+        if tags is not None and tags.received:
+            events |= {"tags_received": tags.received, "tags_late": tags.late}
+        return events
 
     def counts_of(self, sender: str) -> CameraCounts:
         """Return what was counted of `sender` since this master began."""
@@ -243,11 +244,6 @@ class MasterLink:
         kind = self._senders[camera].kinds.get(TagDetections)
         return None if kind is None else kind.sequence.counts
 
-    def _beacon(self) -> Beacon:
-        live = {name: sender.live for name, sender in self._senders.items()}
-        known = {name: session.key_id for name, session in live.items() if session is not None}
-        return Beacon(self._nonce, self._zenoh_endpoint, known)
-
     def _on_hello(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
         hello = self._keys.open_as(header, datagram, Hello)
         if isinstance(hello, Refusal):
@@ -258,14 +254,16 @@ class MasterLink:
         event = self._hello_event(hello, sender)
         rule = RULES[Role.MASTER, self.state(hello.name, t_ns), event]
         if rule.refusal is Refusal.DUPLICATE_SENDER:
-            self.rejected_peers.duplicate(hello.name, address[0], WIRE_VERSION, t_ns)
+            self.rejected_peers.note("duplicate", hello.name, RejectedPeer(address[0], WIRE_VERSION), t_ns)
         if rule.reply is Kind.UNPROVEN:
-            self.rejected_peers.unproven(hello.name, address[0], WIRE_VERSION, t_ns)
+            self.rejected_peers.note("unproven", hello.name, RejectedPeer(address[0], WIRE_VERSION), t_ns)
             unproven = Unproven(self._nonce, hello.slave_nonce, self._keys.has_secrets)
             self._outbox.append((seal(self._sealer, unproven), address))
         if rule.reply is Kind.WELCOME:
-            session = self._of_nonce(sender, hello.slave_nonce)  # its welcome was lost
-            self._welcome(session or self._begin(hello, sender, address, t_ns))
+            again = self._of_nonce(sender, hello.slave_nonce)  # its welcome was lost
+            session = again or self._begin(hello, sender, address, t_ns)
+            welcome = Welcome(self._nonce, hello.slave_nonce, session.session_nonce, session.proof)
+            self._outbox.append((seal(self._sealer, welcome), session.address))
         return rule.refusal
 
     def _hello_event(self, hello: Hello, sender: Sender) -> Event:
@@ -293,22 +291,15 @@ class MasterLink:
         if sender.pending is not None:  # a newer attempt of the slave, which has given that one up
             sender.old_nonces.append(sender.pending.hello.slave_nonce)
             del self._sessions[sender.pending.key_id]
-        sender.pending = self._new_session(hello, address, t_ns)
-        self._sessions[sender.pending.key_id] = sender.pending
-        return sender.pending
-
-    def _new_session(self, hello: Hello, address: Address, t_ns: int) -> Session:
         session_nonce = self._random(NONCE_BYTES)
         keys = self._keys.session(hello, session_nonce)
         sealer = self._keys.session_sealer(keys.to_slave, keys.key_id)
-        return Session(
+        session = Session(
             hello.name, hello, session_nonce, keys.proof, keys.key_id, address, sealer, Opener(keys.to_master),
             since_ns=t_ns, received_ns=t_ns, next_echo_ns=t_ns, next_start_ns=t_ns,
         )  # fmt: skip
-
-    def _welcome(self, session: Session) -> None:
-        welcome = Welcome(self._nonce, session.hello.slave_nonce, session.session_nonce, session.proof)
-        self._outbox.append((seal(self._sealer, welcome), session.address))
+        sender.pending = self._sessions[session.key_id] = session
+        return session
 
     def _on_slave(self, header: Header, datagram: bytes, t_ns: int) -> SensorMessage | Refusal | None:
         session = self._sessions.get(header.key_id)
@@ -330,13 +321,13 @@ class MasterLink:
         opened = session.opener.open(header, datagram)
         if isinstance(opened, Refusal):
             if opened is Refusal.DUPLICATE:
-                sender.main.sequence.duplicate()
+                sender.main.sequence.counts.duplicate += 1
             return opened
         session.received_ns = t_ns
         if sender.pending is session:
             self._confirm(sender, session, t_ns)
         if opened.reordered:
-            sender.main.sequence.reordered()
+            sender.main.sequence.counts.reordered += 1
         if header.kind is Kind.DATA:
             return self._take_data(session, sender, opened, header.counter, t_ns)
         if opened.reordered:
@@ -384,7 +375,8 @@ class MasterLink:
             return Refusal.IMPOSTOR
         if (why := not_admitted(message, session, sender, now_ns)) is not None:
             if why is Refusal.MARKER_COUNT and isinstance(message, MarkerDetections):
-                self.rejected_peers.marker_count(name, len(message.area), sender.limits.markers or 0, now_ns)
+                counts = MarkerCounts(len(message.area), sender.limits.markers or 0)
+                self.rejected_peers.note("markers", name, counts, now_ns)
             return why
         session.started = True
         if opened.reordered:

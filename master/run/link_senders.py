@@ -16,7 +16,7 @@ from collections import Counter, deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from math import hypot
-from typing import NamedTuple, TypeAlias, TypeVar
+from typing import Literal, NamedTuple, TypeAlias
 
 from common.arrays import Float
 from common.clock import TokenBucket
@@ -222,9 +222,6 @@ def on_master_clock(
     )
 
 
-SeenT = TypeVar("SeenT")
-
-
 class RejectedPeer(NamedTuple):
     """Where somebody who was rejected sends from: host, and what wire version."""
 
@@ -239,28 +236,24 @@ class MarkerCounts(NamedTuple):
     expected: int
 
 
+Rejected: TypeAlias = Literal["duplicate", "version", "unproven", "markers"]
+
+
 class RejectedPeers:
-    """Push machine: when each sender was last rejected, and from where."""
+    """Push machine: when each sender was last rejected, why, and from where."""
 
     def __init__(self, keys: RigKeys, names: Iterable[str]) -> None:
         self._keys, self._names = keys, frozenset(names)
-        self._duplicates: dict[str, tuple[int, RejectedPeer]] = {}
-        self._versions: dict[str, tuple[int, RejectedPeer]] = {}
-        self._unproven: dict[str, tuple[int, RejectedPeer]] = {}
-        self._markers: dict[str, tuple[int, MarkerCounts]] = {}
+        self._seen: dict[tuple[Rejected, str], tuple[int, RejectedPeer | MarkerCounts]] = {}
         self._next_ns: int | None = None
 
-    def duplicate(self, name: str, host: str, version: int, t_ns: int) -> None:
-        """Record a second process under `name`, at `t_ns`, while the first one was well."""
-        self._duplicates[name] = t_ns, RejectedPeer(host, version)
+    def note(self, why: Rejected, name: str, found: RejectedPeer | MarkerCounts, t_ns: int) -> None:
+        """Record what was rejected as `name` at `t_ns`.
 
-    def unproven(self, name: str, host: str, version: int, t_ns: int) -> None:
-        """Record a hello as `name` without that device's secret."""
-        self._unproven[name] = t_ns, RejectedPeer(host, version)
-
-    def marker_count(self, name: str, sent: int, expected: int, t_ns: int) -> None:
-        """Record that `name` sent another number of markers than its rig has here."""
-        self._markers[name] = t_ns, MarkerCounts(sent, expected)
+        A second process while the first was well ("duplicate"), a hello without that device's secret
+        ("unproven"), or another number of markers than its rig has here ("markers").
+        """
+        self._seen[why, name] = t_ns, found
 
     def other_version(self, datagram: bytes, host: str, t_ns: int) -> None:
         """Record a datagram of another wire version, if it is a sealed hello of this rig."""
@@ -273,28 +266,23 @@ class RejectedPeers:
         self._next_ns = t_ns + poll_ns
         name = self._keys.name_in(Header(Kind.HELLO, key_id, counter), datagram)
         if name in self._names:
-            self._versions[name] = t_ns, RejectedPeer(host, version)
+            self.note("version", name, RejectedPeer(host, version), t_ns)
 
-    def duplicates(self, t_ns: int) -> dict[str, RejectedPeer]:
-        """Name -> where its second process is, as of `t_ns` [ns]."""
-        return _lately(self._duplicates, t_ns)
-
-    def versions(self, t_ns: int) -> dict[str, RejectedPeer]:
-        """Name -> where it is and what it speaks, as of `t_ns` [ns]."""
-        return _lately(self._versions, t_ns)
-
-    def secrets(self, t_ns: int) -> dict[str, RejectedPeer]:
-        """Name -> where hellos without its secret come from, as of `t_ns` [ns]."""
-        return _lately(self._unproven, t_ns)
+    def lately(self, why: Rejected, t_ns: int) -> dict[str, RejectedPeer]:
+        """Name -> from where it was rejected for this as of `t_ns`, but for markers."""
+        return {name: found for name, found in self._of(why, t_ns) if isinstance(found, RejectedPeer)}
 
     def marker_counts(self, t_ns: int) -> dict[str, MarkerCounts]:
         """Name -> how many markers it sent and has here, where these differ."""
-        return _lately(self._markers, t_ns)
+        return {name: found for name, found in self._of("markers", t_ns) if isinstance(found, MarkerCounts)}
 
-
-def _lately(seen: dict[str, tuple[int, SeenT]], t_ns: int) -> dict[str, SeenT]:
-    lately_ns = 1_500_000_000  # both send a hello again within a second
-    return {name: what for name, (seen_ns, what) in seen.items() if t_ns - seen_ns < lately_ns}
+    def _of(self, why: Rejected, t_ns: int) -> list[tuple[str, RejectedPeer | MarkerCounts]]:
+        lately_ns = 1_500_000_000  # both send a hello again within a second
+        return [
+            (name, found)
+            for (kind, name), (seen_ns, found) in self._seen.items()
+            if kind == why and t_ns - seen_ns < lately_ns
+        ]
 
 
 FIRST_NS = 1_000_000_000
@@ -303,26 +291,20 @@ MAX_CAUSES = 256  # that are remembered: later ones are counted, not logged
 _LOG = logging.getLogger(__name__)
 
 
-@dataclass(slots=True)
-class _Silence:
-    until_ns: int
-    length_ns: int
-
-
 class Quarantine:
     """Push machine over faults; `fault` and `holds` may be called on several threads."""
 
     def __init__(self) -> None:
-        self._silences: dict[str, _Silence] = {}
+        self._silences: dict[str, tuple[int, int]] = {}  # until when, and how long [ns]
         self._causes: set[tuple[str, str]] = set()
         self.faults: Counter[str] = Counter()
 
     def fault(self, sender: str, error: Exception, t_ns: int) -> None:
         """A message of `sender` made something raise `error` at `t_ns` [ns]."""
-        before = self._silences.get(sender)
-        again = before is not None and t_ns < before.until_ns + LONGEST_NS
-        length_ns = min(2 * before.length_ns, LONGEST_NS) if before is not None and again else FIRST_NS
-        self._silences[sender] = _Silence(t_ns + length_ns, length_ns)
+        until_ns, before_ns = self._silences.get(sender, (-LONGEST_NS, 0))
+        again = before_ns > 0 and t_ns < until_ns + LONGEST_NS
+        length_ns = min(2 * before_ns, LONGEST_NS) if again else FIRST_NS
+        self._silences[sender] = t_ns + length_ns, length_ns
         self.note(sender, error)
 
     def note(self, sender: str, error: Exception) -> None:
@@ -339,8 +321,8 @@ class Quarantine:
 
     def holds(self, sender: str, t_ns: int) -> bool:
         """Whether `sender` is silenced at `t_ns` [ns]."""
-        silence = self._silences.get(sender)
-        return silence is not None and t_ns < silence.until_ns
+        until_ns, _ = self._silences.get(sender, (t_ns, 0))
+        return t_ns < until_ns
 
 
 def _place(error: Exception) -> str:

@@ -11,7 +11,6 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from common.bus.zenoh_bus import ZenohBus
 from common.clock import Clock, SystemClock
 from common.link.datagram import LinkKey
 from common.supervisor import ServiceManager, until
@@ -20,17 +19,17 @@ from master.checklist.publisher import ChecklistPublisher
 from master.commands.summary import write_summary
 from master.monitor.clocks import ClockMonitor
 from master.monitor.report import ExtrinsicsMonitor, MonitoredLoop, Reporter, unplaced_line
-from master.outputs.bus import BusSink, DevicePoses, Sink
+from master.outputs.bus import BusSink, Sink, publishing_devices
 from master.outputs.poses import RunFiles
 from master.recording.probe import Probe, RecorderProcess, Tapped
 from master.rig.setup import RigFiles, RigSetup
-from master.run.app import Observed, RunFigures, StageTimes, run
+from master.run.app import RunFigures, StageTimes, observed, run
 from master.run.dispatcher import Dispatcher, new_dispatcher
 from master.run.ingest import Ingest
 from master.run.link_senders import limits_of
 from master.run.process import host_bus
 from master.run.solver_supervisor import LoadShedding, Shedding, SolverSupervisor
-from master.run.tuning import LivePipeline, RigTuning, renew
+from master.run.tuning import LivePipeline, RigTuning
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,25 +40,21 @@ class LiveSettings:
         beacon: Broadcast address and port where slaves listen.
         bind: Own UDP address and port for data (0: any).
         bus: Endpoint on which the zenoh bus listens, for example tls/0.0.0.0:47802.
+        files: Where the setups were read: what changes there is used at once.
         start_timeout_s: How long the first slave waits for the others.
         poses: Where to write poses.npz, or None; those of a second hand stand beside it under its name, and
             objects, contact and gestures in its folder.
-        files: Where the setups were read: what changes there is used at once. None: they stay as they are.
-        record: Where to record all that is received and published (MCAP), or None; needs `files`.
+        record: Where to record all that is received and published (MCAP), or None.
     """
 
     beacon: tuple[str, int]
     bind: tuple[str, int]
     bus: str
+    files: RigFiles
     start_timeout_s: float = 5.0
     poses: Path | None = None
     summary: Path | None = None
-    files: RigFiles | None = None
     record: Path | None = None
-
-    def __post_init__(self) -> None:
-        if self.record is not None and self.files is None:
-            raise ValueError("record: a recording carries the files of its rigs: give files, too")
 
 
 def run_live(
@@ -83,15 +78,13 @@ def run_live(
     load_shedding = LoadShedding(setups)
     pipelines = [LivePipeline(setup, stages, Shedding(load_shedding)) for setup in setups]
     dispatcher = Dispatcher(setups, pipelines, stages)
-    tuning = (
-        None if settings.files is None else RigTuning(settings.files, setups, pipelines, notify, dispatcher)
-    )
+    tuning = RigTuning(settings.files, setups, pipelines, notify, dispatcher)
     with ExitStack() as stack:
         bus = host_bus(settings.bus, devices_of(setups))
         stack.callback(bus.close)
         probe = Probe(bus, clock, always=settings.record is not None)
         stack.callback(probe.close)
-        if settings.record is not None and settings.files is not None:
+        if settings.record is not None:
             recorder = RecorderProcess(
                 settings.record, settings.files, settings.bus, notify, probe.end_always
             )
@@ -100,7 +93,9 @@ def run_live(
         ingest = ingest_of(setups, key, clock, settings)
         stack.callback(ingest.close)
         load_shedding.waiting = ingest.queue.frame_spans
-        sinks = _sinks(setups, settings, bus)
+        sinks: list[Sink] = [BusSink(bus)]
+        if settings.poses is not None:
+            sinks.append(RunFiles.of(settings.poses, setups))
         for sink in sinks:
             stack.callback(sink.close)
         monitor = ClockMonitor(setups)
@@ -120,25 +115,22 @@ def run_live(
             stop,
             notify,
         )
-        files = (
-            None if settings.files is None else FileMonitor(settings.files.calibration, settings.files.rigs)
-        )
+        files = FileMonitor(settings.files.calibration, settings.files.rigs)
         writes_to = Path.cwd() if settings.poses is None else settings.poses.parent
         checklist = ChecklistPublisher(
             bus, clock, ingest, setups, pipelines, files, reporter.session, writes_to
         )
-        in_use = (lambda: setups) if tuning is None else (lambda: tuning.setups)
         supervisor = SolverSupervisor(
-            Observed(dispatcher.push, figures.rates, monitor.push).push,
+            observed(dispatcher.push, figures.rates, monitor.push),
             ingest.quarantine,
             clock,
-            (lambda sender: renew(setups, pipelines, dispatcher, sender)) if tuning is None else tuning.renew,
-            lambda sender: new_dispatcher([setup for setup in in_use() if sender in setup.senders]),
+            tuning.renew,
+            lambda sender: new_dispatcher([setup for setup in tuning.setups if sender in setup.senders]),
         )
         threads = (
             threading.Thread(target=until(stop.is_set, reporter.work), name="master health", daemon=True),
             threading.Thread(
-                target=until(stop.is_set, lambda: checklist.work(stop, in_use)),
+                target=until(stop.is_set, lambda: checklist.work(stop, lambda: tuning.setups)),
                 name="master checklist",
                 daemon=True,
             ),
@@ -151,7 +143,7 @@ def run_live(
         notify(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
-        source = Tapped(DevicePoses(ingest.queue.get, bus).get, probe, load_shedding)
+        source = Tapped(publishing_devices(ingest.queue.get, bus), probe, load_shedding)
         loop = MonitoredLoop(source.get, ServiceManager(os.environ))
         run(loop.get, supervisor.push, sinks, clock, figures, stop)
         source.flush()
@@ -171,15 +163,6 @@ def run_live(
     if settings.summary is not None:
         write_summary(settings.summary, summary)
     return summary
-
-
-def _sinks(setups: Sequence[RigSetup], settings: LiveSettings, bus: ZenohBus) -> list[Sink]:
-    sinks: list[Sink] = [BusSink(bus)]
-    if settings.poses is not None:
-        counts = {setup.hand.profile.name: len(setup.markers) for setup in setups}
-        objects = [one.name for setup in setups for one in setup.objects]
-        sinks.append(RunFiles(settings.poses, counts, objects))
-    return sinks
 
 
 def cameras_of(setups: Sequence[RigSetup]) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ SEQ_JUMP, SEQ_PER_S = 100_000, 10_000.0  # numbers rise by no more: at once, and
 CYCLE_FRAMES = 3  # frames that become one message of a wrist device
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class CameraCounts:
     """Counters of one camera since the master began.
 
@@ -46,7 +46,7 @@ class Sequence:
     """Push machine that counts frame numbers; holds the newest 1024 missing ones.
 
     Attributes:
-        lost: Numbers that have not come so far.
+        counts: What was counted so far.
         last: The newest number; -1: none came.
     """
 
@@ -56,24 +56,12 @@ class Sequence:
         `step` is how much the number rises from one message to the next; None: as it likes, and nothing is
         ever missing.
         """
-        self.lost = 0
-        self._received = self._late = self._duplicate = self._reordered = 0
+        self.counts = CameraCounts()
         self._regular, self._step = step is not None, step or 1
         self._slip = self._step // 2
         self._session: int | None = None
         self.last = -1
         self._missing: OrderedDict[int, None] = OrderedDict()
-
-    @property
-    def counts(self) -> CameraCounts:
-        """What was counted so far."""
-        return CameraCounts(
-            received=self._received,
-            lost=self.lost,
-            late=self._late,
-            duplicate=self._duplicate,
-            reordered=self._reordered,
-        )
 
     def follows(self, session: int) -> bool:
         """Whether the last message was of the same slave process."""
@@ -93,26 +81,18 @@ class Sequence:
             found = next((number for number in near if number in self._missing), None)
             if found is not None:
                 del self._missing[found]
-                self.lost -= 1
-            self._late += 1
+                self.counts.lost -= 1
+            self.counts.late += 1
             return False
         elif self._regular and seq != self.last + self._step:
             skipped = range(self.last + self._step, seq - self._slip, self._step)
-            self.lost += len(skipped)
+            self.counts.lost += len(skipped)
             self._missing.update(OrderedDict.fromkeys(skipped[-REMEMBERED:]))
             while len(self._missing) > REMEMBERED:
                 self._missing.popitem(last=False)
         self.last = seq
-        self._received += 1
+        self.counts.received += 1
         return True
-
-    def duplicate(self) -> None:
-        """Count a datagram that came twice."""
-        self._duplicate += 1
-
-    def reordered(self) -> None:
-        """Count a datagram that came after a later one."""
-        self._reordered += 1
 
 
 @dataclass(slots=True)
@@ -199,9 +179,9 @@ class Counted:
 
         `missing`: how many datagrams between two that came did not (`Opener.missing_between`).
         """
-        before = self.sequence.lost
+        before = self.sequence.counts.lost
         used = self.sequence.take(session, seq)
-        missed = self.sequence.lost - before
+        missed = self.sequence.counts.lost - before
         if not used:
             self.losses.late(counter, -missed)
             return False

@@ -11,8 +11,9 @@ import threading
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import ceil, nan
+from typing import TypeAlias
 
 import msgspec
 
@@ -21,12 +22,12 @@ from common.calibration import FilterCalibration, parse
 from common.calibration.files import MonitoredFiles, Part
 from common.errors import CalibrationError, PhalanxError
 from common.messages import Detections, Name
-from master.estimator.pipeline import SolvedPose, Stage
+from master.estimator.pipeline import SolvedPose
+from master.fabrik.solver import Stage
 from master.rig.pipeline import Pipeline, pipeline_of
 from master.rig.setup import RigFiles, RigSetup
 from master.run.dispatcher import Dispatcher
 
-_OF_CAMERA = ("width_px", "height_px")
 _ALL = "give all processes of the rig the same files, then restart them"
 _MASTER = "restart the master"
 
@@ -45,28 +46,25 @@ def refuse_restart(old: RigSetup, new: RigSetup) -> None:
         CalibrationError: With the key, and what to restart.
     """
     where = f"rig {new.rig.name!r}"
-    if old.rig.kind != new.rig.kind:
-        raise _refusal(f"{where}: kind", (old.rig.kind,), (new.rig.kind,), _ALL)
-    for key, was, now in (
-        ("cameras", old.camera_names, new.camera_names),
-        ("markers", old.markers, new.markers),
-    ):
+    fixed: list[tuple[str, Sequence[str], Sequence[str], str]] = [
+        (f"{where}: kind", (old.rig.kind,), (new.rig.kind,), _ALL),
+        (f"{where}: cameras", old.camera_names, new.camera_names, _ALL),
+        (f"{where}: markers", old.markers, new.markers, _ALL),
+        (f"{where}: objects", [one.name for one in old.objects], [one.name for one in new.objects], _ALL),
+        (f"{where}: tracker of its objects", old.trackers, new.trackers, _MASTER),
+        (f"{where}: imu.name", old.imus, new.imus, _MASTER),
+    ]
+    for name in (name for name in new.cameras if name in old.cameras):
+        was, now = old.cameras[name], new.cameras[name]
+        for key in ("width_px", "height_px"):
+            fixed.append(
+                (f"camera {name!r}: {key}", [str(getattr(was, key))], [str(getattr(now, key))], _ALL)
+            )
+    for key, was, now, remedy in fixed:
         if was != now:
-            raise _refusal(f"{where}: {key}", was, now, _ALL)
+            raise _refusal(key, was, now, remedy)
     if old.rows != new.rows:
         raise CalibrationError(f"{where}: markers: cannot stand in another order while it runs: {_ALL}")
-    was, now = (tuple(one.name for one in setup.objects) for setup in (old, new))
-    if was != now:
-        raise _refusal(f"{where}: objects", was, now, _ALL)
-    if old.trackers != new.trackers:
-        raise _refusal(f"{where}: tracker of its objects", old.trackers, new.trackers, _MASTER)
-    if old.imus != new.imus:
-        raise _refusal(f"{where}: imu.name", old.imus, new.imus, _MASTER)
-    for name, camera in new.cameras.items():
-        for key in _OF_CAMERA:
-            was, now = getattr(old.cameras[name], key), getattr(camera, key)
-            if was != now:
-                raise _refusal(f"camera {name!r}: {key}", (str(was),), (str(now),), _ALL)
 
 
 def _refusal(key: str, was: Sequence[str], now: Sequence[str], remedy: str) -> CalibrationError:
@@ -94,13 +92,8 @@ class _WhenOpen:
         return self._stage(name) if self.open else nullcontext()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _OrientationSample:
-    """One orientation measured by an IMU, as `Pipeline.push_orientation` takes it."""
-
-    t_ns: int
-    orientation_wxyz: Float
-    heading_sigma_rad: float
+# What a message does to a pipeline.
+_Shown: TypeAlias = Callable[[Pipeline], list[SolvedPose]]
 
 
 class LivePipeline:
@@ -124,9 +117,7 @@ class LivePipeline:
         close_frames = 2  # of each camera: what may be left for the loop to catch up with
         self._close = close_frames * per_frame
         warm_frames = 6  # of each camera: tracks need two, and the shipped 1 € filter has settled after 0.1 s
-        self._recent: deque[tuple[int, Detections | _OrientationSample]] = deque(
-            maxlen=warm_frames * per_frame
-        )
+        self._recent: deque[tuple[int, _Shown]] = deque(maxlen=warm_frames * per_frame)
         self._number = 0
         self._last_ns = -(2**63)
         # And the number of the last message it has seen. One thread fills it, another empties it.
@@ -139,8 +130,7 @@ class LivePipeline:
 
     def push(self, message: Detections) -> list[SolvedPose]:
         """Take one camera's detections; return the poses they complete, oldest first."""
-        self._number += 1
-        self._recent.append((self._number, message))
+        self._keep(lambda pipeline: pipeline.push(message))
         solved = self._take_over(*self._next.popleft()) if self._next else self._now.push(message)
         if solved:
             self._last_ns = solved[-1].pose.t_ns
@@ -148,9 +138,17 @@ class LivePipeline:
 
     def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
         """Take an orientation (4,) measured by the hand's IMU."""
+
+        def show(pipeline: Pipeline) -> list[SolvedPose]:
+            pipeline.push_orientation(t_ns, orientation_wxyz, heading_sigma_rad)
+            return []
+
+        self._keep(show)
+        show(self._now)
+
+    def _keep(self, show: _Shown) -> None:
         self._number += 1
-        self._recent.append((self._number, _OrientationSample(t_ns, orientation_wxyz, heading_sigma_rad)))
-        self._now.push_orientation(t_ns, orientation_wxyz, heading_sigma_rad)
+        self._recent.append((self._number, show))
 
     def flush(self) -> list[SolvedPose]:
         """Nothing comes any more: the poses that still wait for something."""
@@ -162,19 +160,13 @@ class LivePipeline:
         self._recent.clear()
         take()
 
-    def change(self, setup: RigSetup) -> None:
-        """Replace the running pipeline by one of `setup`, from any thread but the loop's.
-
-        Raises:
-            CalibrationError: The depth model does not fit the rig; nothing has changed.
-        """
-        self.prepare(setup)()
-
     def prepare(self, setup: RigSetup) -> Callable[[], None]:
         """Build a pipeline of `setup`; return what warms it up and switches to it.
 
+        From any thread but the loop's.
+
         Raises:
-            CalibrationError: As `change`.
+            CalibrationError: The depth model does not fit the rig; nothing has changed.
         """
         stage = _WhenOpen(self._stage)
         # What it is shown to warm up has been solved by the other already: nothing of it is dropped.
@@ -197,9 +189,9 @@ class LivePipeline:
         """Show it the last messages; return the number of the last one."""
         shown = 0
         for _ in range(_ROUNDS):  # while these are solved, more come
-            waiting = [(number, sample) for number, sample in list(self._recent) if number > shown]
-            for number, sample in waiting:
-                _show(new, sample)
+            waiting = [(number, show) for number, show in list(self._recent) if number > shown]
+            for number, show in waiting:
+                show(new)
                 shown = number
             if len(waiting) <= self._close:
                 break
@@ -210,8 +202,8 @@ class LivePipeline:
         old, self._now = self._now.counts, new
         new.counts.clear()
         new.counts.update(old)
-        missed = [sample for number, sample in self._recent if number > shown]
-        solved = [one for sample in missed for one in _show(new, sample)]
+        missed = [show for number, show in self._recent if number > shown]
+        solved = [one for show in missed for one in show(new)]
         later = [one for one in solved if one.pose.t_ns > self._last_ns]
         new.counts["poses"] -= len(solved) - len(later)
         return later
@@ -286,9 +278,13 @@ class RigTuning:
             self._use(lambda: _with_filter(self._setups, trial))
 
     def renew(self, sender: str) -> None:
-        """As the function `renew`, of the setups in use."""
+        """Replace all solvers that `sender` feeds: the state of the old may be broken."""
         with self._lock:
-            renew(self._setups, self._pipelines, self._dispatcher, sender)
+            for setup, pipeline in zip(self._setups, self._pipelines, strict=True):
+                if sender in setup.senders:
+                    pipeline.renew()
+            if self._dispatcher is not None:
+                self._dispatcher.prepare(self._setups)()
 
     def _use(self, get: Callable[[], Sequence[RigSetup]]) -> bool:
         """Use these setups, all or none; False if they were in use."""
@@ -316,21 +312,6 @@ class RigTuning:
         return True
 
 
-def renew(
-    setups: Sequence[RigSetup], pipelines: Sequence[LivePipeline], dispatcher: Dispatcher | None, sender: str
-) -> None:
-    """Replace all solvers that `sender` feeds: the state of the old may be broken.
-
-    `setups` and `pipelines` are those of each hand; `dispatcher` makes what is beside the hands; None:
-    nothing is.
-    """
-    for setup, pipeline in zip(setups, pipelines, strict=True):
-        if sender in setup.senders:
-            pipeline.renew()
-    if dispatcher is not None:
-        dispatcher.prepare(setups)()
-
-
 def _with_filter(setups: Sequence[RigSetup], trial: FilterTrial) -> list[RigSetup]:
     names = [setup.rig.name for setup in setups]
     if trial.rig not in names:
@@ -349,13 +330,6 @@ def _messages_per_frame(setup: RigSetup) -> int:
     imus = [rig.imu for rig in (setup.rig, setup.wrist_rig) if rig is not None and rig.imu is not None]
     samples = max((imu.rate_hz for imu in imus), default=0.0) / slowest_hz
     return len(setup.camera_names) + ceil(samples)
-
-
-def _show(pipeline: Pipeline, sample: Detections | _OrientationSample) -> list[SolvedPose]:
-    if isinstance(sample, _OrientationSample):
-        pipeline.push_orientation(sample.t_ns, sample.orientation_wxyz, sample.heading_sigma_rad)
-        return []
-    return pipeline.push(sample)
 
 
 def _content(setup: RigSetup) -> tuple[object, ...]:

@@ -64,13 +64,13 @@ def grey(data: npt.NDArray[np.uint8], name: str, size: tuple[int, int], stride: 
     if name in _PACKED:
         group, pixels = _PACKED[name]
         groups = -(-width // pixels)
-        rows = _rows(data, height, stride, groups * group)
+        rows = rows_of(data, height, stride, groups * group)
         if rows is None:
             return None
         highest = np.ascontiguousarray(rows).reshape(height, groups, group)[..., :pixels].reshape(height, -1)
         return np.ascontiguousarray(highest[:, :width])
     depth = _DEPTH.get(name, 8)
-    rows = _rows(data, height, stride, width * (1 if depth == 8 else 2))
+    rows = rows_of(data, height, stride, width * (1 if depth == 8 else 2))
     if rows is None:
         return None
     if depth == 8:
@@ -93,7 +93,7 @@ def luma(
     """
     width, height = size
     step, first = _LUMA[name]
-    rows = _rows(data, height, stride, width * step)
+    rows = rows_of(data, height, stride, width * step)
     if rows is None:
         return None
     plane = np.ascontiguousarray(rows[:, first::step])
@@ -114,7 +114,7 @@ def _refuse_low(words: npt.NDArray[np.uint16]) -> None:
         )
 
 
-def _rows(data: npt.NDArray[np.uint8], height: int, stride: int, used: int) -> Image | None:
+def rows_of(data: npt.NDArray[np.uint8], height: int, stride: int, used: int) -> Image | None:
     """The bytes (height, used) of the rows without padding; None: too few."""
     if stride < used or data.size < stride * (height - 1) + used:
         return None

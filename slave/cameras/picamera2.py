@@ -10,10 +10,8 @@ run in step keep their rate. Whatever fails raises `CameraError`, which states w
 import contextlib
 import logging
 import threading
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
-
-import numpy as np
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, TypeVar
 
 from common.arrays import Image
 from common.calibration import CameraCalibration
@@ -24,13 +22,14 @@ from slave.cameras.picamera2_settings import (
     LIVE_CONTROLS,
     RATE_CONTROL,
     Picamera2Options,
+    Request,
     check_ranges,
     controls,
     open_library,
     read_figures,
     wanted_settings,
 )
-from slave.cameras.picamera2_streams import Streams, choose_mode, choose_raw_mode, read_modes, view_text
+from slave.cameras.picamera2_streams import Streams, choose_mode, choose_raw_mode, read_modes
 from slave.cameras.picamera2_timing import SyncMonitor, Timeline, wait_in_step
 from slave.cameras.settings import FrameObserver, as_values, change, demand, differences
 from slave.sources import Frame, Tunable
@@ -39,6 +38,7 @@ BUFFERS = 6  # picamera2's own number for video: the pipeline never starves whil
 TIMEOUT_S = 2.0  # libcamera itself gives a silent sensor up after 1 s
 SETTLE_FRAMES = 60  # sensors apply exposure and gain 2-3 frames late, the pipeline adds its own depth: ample
 _LOG = logging.getLogger(__name__)
+T = TypeVar("T")
 
 
 class Picamera2Camera(Tunable):
@@ -64,9 +64,16 @@ class Picamera2Camera(Tunable):
         self._library, self._enums = open_library(options.index)
         try:
             self._start()
-            self._settle(calibration, (self._capture(with_image=False)[0] for _ in range(SETTLE_FRAMES)))
+            self._settle(calibration, (self._unread() for _ in range(SETTLE_FRAMES)))
             if options.sync != "off":
-                self._synchronise(stop)
+                wait_in_step(
+                    self._unread,
+                    self._where,
+                    options.sync,
+                    options.sync_timeout_s,
+                    clock,
+                    lambda: stop is not None and stop.is_set(),
+                )
         except BaseException:
             with contextlib.suppress(CameraError):  # the first error is the one to read
                 self.close()
@@ -80,7 +87,13 @@ class Picamera2Camera(Tunable):
     def read(self) -> Frame | None:
         """Wait for the next frame; None once closed."""
         while not self._closed:
-            metadata, image, lores = self._capture(with_image=True)
+            metadata, image, lores = self._capture(
+                lambda request: (
+                    dict(request.get_metadata()),
+                    self._streams.image(request),
+                    self._streams.small(request),
+                )
+            )
             self._metadata.put(metadata)
             if self._sync is not None:
                 self._sync.push(metadata)
@@ -195,7 +208,7 @@ class Picamera2Camera(Tunable):
         except (RuntimeError, ValueError) as error:
             raise CameraError(f"{self._where}: cannot be started: {error}") from error
         model = library.camera_properties.get("Model", "unknown model")
-        _LOG.info("%s: %s, mode %s", self._where, model, view_text(mode, modes))
+        _LOG.info("%s: %s, mode %s", self._where, model, mode.text(modes))
 
     def _settle(self, camera: CameraCalibration, frames: Iterable[Mapping[str, object]]) -> None:
         """Wait until some `frames` (metadata) in a row have every setting of `camera`."""
@@ -213,27 +226,16 @@ class Picamera2Camera(Tunable):
             f"{self._where}: its settings do not stay: they were right, but not {good_frames} frames long"
         )
 
-    def _synchronise(self, stop: threading.Event | None) -> None:
-        options = self._options
-        wait_in_step(
-            lambda: self._capture(with_image=False)[0],
-            self._where,
-            options.sync,
-            options.sync_timeout_s,
-            self._clock,
-            lambda: stop is not None and stop.is_set(),
-        )
+    def _unread(self) -> dict[str, object]:
+        """Metadata of the next frame, which is thrown away."""
+        return self._capture(lambda request: dict(request.get_metadata()))
 
-    def _capture(self, with_image: bool) -> tuple[dict[str, object], Image, Image | None]:
-        """Metadata, image and small image of one request; no images where not asked for."""
-        empty = np.empty((0, 0, 3), np.uint8)
+    def _capture(self, read: Callable[[Request], T]) -> T:
+        """What is read from the next request."""
         try:
             request = self._library.capture_request(wait=TIMEOUT_S)
             try:
-                metadata = dict(request.get_metadata())
-                if not with_image:
-                    return metadata, empty, None
-                return metadata, self._streams.image(request), self._streams.small(request)
+                return read(request)
             finally:
                 request.release()
         except TimeoutError as error:

@@ -131,12 +131,8 @@ def open_library(index: int) -> tuple[Library, Enums]:
             f"--camera picamera2:{index}: cannot be opened ({error.__cause__ or error}); another program may "
             "have it: stop that, or restart the Pi"
         ) from error
-    return library, _enums(controls)
-
-
-def _enums(controls: Any) -> Enums:
     sync = getattr(getattr(controls, "rpi", None), "SyncModeEnum", None)
-    return Enums(
+    return library, Enums(
         controls.draft.NoiseReductionModeEnum.Off,
         controls.AfModeEnum.Manual,
         getattr(sync, "Server", None),
@@ -218,10 +214,9 @@ def _sync(options: Picamera2Options, enums: Enums, available: Mapping[str, objec
             f"--sync {options.sync}: this libcamera cannot synchronise cameras; update the system "
             "(`sudo apt full-upgrade`), or leave --sync away: the master brings free-running cameras to one time"
         )
-    # libcamera's default: the server notifies the clients every 30 frames, so each receives it three times
-    sync_frames = 100
-    # The number of frames until "ready" is set by the server (control_ids_rpi.yaml, SyncFrames).
-    return {"SyncMode": mode} | ({"SyncFrames": sync_frames} if options.sync == "server" else {})
+    # The number of frames until "ready" is set by the server (control_ids_rpi.yaml, SyncFrames); libcamera's default:
+    # the server notifies the clients every 30 frames, so each receives it three times
+    return {"SyncMode": mode} | ({"SyncFrames": 100} if options.sync == "server" else {})
 
 
 def check_ranges(asked: Mapping[str, Any], available: Mapping[str, tuple[Any, Any, Any]]) -> None:
@@ -247,10 +242,9 @@ def wanted_settings(
 ) -> tuple[Setting, ...]:
     """The values that the metadata of a frame must have, with tolerances as above."""
     # where the camera file states 0: no official sensor needs longer for a row at video rates
-    global_shutter_row_us = 30.0
-    row_us = camera.row_time_us if camera.row_time_us > 0.0 else global_shutter_row_us
-    exposure_share = 0.01  # a hundredth of the exposure is below the noise of an 8-bit pixel
-    exposure = row_us + exposure_share * camera.exposure_us
+    row_us = camera.row_time_us if camera.row_time_us > 0.0 else 30.0
+    # a hundredth of the exposure is below the noise of an 8-bit pixel
+    exposure = row_us + 0.01 * camera.exposure_us
     gain = max(1.0 / 16.0, camera.analogue_gain**2 / 256.0)
     digital = exposure / camera.exposure_us + gain / camera.analogue_gain
     rate = f"frame_rate_hz {camera.frame_rate_hz:g}"
@@ -261,11 +255,9 @@ def wanted_settings(
         Setting("FrameDuration", (1e6 / camera.frame_rate_hz,), row_us + 1.0, "us", rate),
     ]
     if pixels is Pixels.COLOUR or "ColourGains" in available:
-        colour_gain = 0.01
-        wanted.append(Setting("ColourGains", camera.colour_gains, colour_gain, "", "colour_gains"))
+        wanted.append(Setting("ColourGains", camera.colour_gains, 0.01, "", "colour_gains"))
     if "AfMode" in available and camera.focus_m is not None:
-        dioptres = 0.05
-        wanted.append(Setting("LensPosition", (1.0 / camera.focus_m,), dioptres, "dioptres", "focus_m"))
+        wanted.append(Setting("LensPosition", (1.0 / camera.focus_m,), 0.05, "dioptres", "focus_m"))
     return tuple(wanted)
 
 

@@ -14,7 +14,7 @@ bits on top. Modes of 8 bits are `R8` on both.
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,8 +25,6 @@ from common.errors import CameraError
 from slave.cameras.grey import Pixels, grey, luma
 from slave.cameras.picamera2_settings import Request
 
-ROUNDING_HZ = 0.005  # picamera2 rounds rates to two digits
-SAME_VIEW = 0.98  # crops that differ by a few rows of alignment show the same
 # libcamera's R8, R10_CSI2P, MONO_PISP_COMP1; mosaics are SRGGB10, RGGB_PISP_COMP1 and so on.
 MONO = re.compile(r"R\d|MONO")
 FACTS = (
@@ -51,11 +49,15 @@ class SensorMode:
         """Pixels of the array that the mode sees."""
         return self.crop[2] * self.crop[3]
 
-    def text(self, widest: int) -> str:
-        """The mode in words; `widest` is the area of the widest mode."""
+    def text(self, modes: "Sequence[SensorMode]") -> str:
+        """The mode in words, as one of all `modes`."""
         width, height = self.size
-        share = 100.0 * self.area / widest
+        share = 100.0 * self.area / max(mode.area for mode in modes)
         return f"{width}x{height} {self.bit_depth} bit, up to {self.rate_hz:.1f} Hz, {share:.0f} % of the full view"
+
+    def reaches(self, rate_hz: float) -> bool:
+        """Whether it is so fast; picamera2 rounds rates to two digits."""
+        return self.rate_hz + 0.005 >= rate_hz
 
 
 def read_modes(modes: Sequence[Mapping[str, Any]]) -> tuple[SensorMode, ...]:
@@ -83,21 +85,24 @@ def choose_mode(modes: Sequence[SensorMode], rate_hz: float, size: tuple[int, in
         raise CameraError(
             "the camera has no raw sensor modes; a USB camera is opened with --camera v4l2:DEVICE"
         )
-    widest = max(mode.area for mode in modes)
-    able = [
-        mode
-        for mode in modes
-        if mode.rate_hz + ROUNDING_HZ >= rate_hz and mode.size[0] >= size[0] and mode.size[1] >= size[1]
-    ]
+    width, height = size
+    able = [m for m in modes if m.reaches(rate_hz) and m.size[0] >= width and m.size[1] >= height]
     if not able:
-        listed = "; ".join(mode.text(widest) for mode in modes)
         raise CameraError(
-            f"no mode of the camera delivers {size[0]}x{size[1]} at {rate_hz:g} Hz. It has: {listed}. Lower "
+            f"no mode of the camera delivers {width}x{height} at {rate_hz:g} Hz. It has: {_listed(modes)}. Lower "
             f"frame_rate_hz, width_px or height_px in the camera file, or use another camera. {FACTS}"
         )
-    view = max(mode.area for mode in able)
-    same = [mode for mode in able if mode.area >= SAME_VIEW * view]
-    return min(same, key=lambda mode: (mode.size[0] * mode.size[1], -mode.bit_depth))
+    return min(_widest(able), key=lambda mode: (mode.size[0] * mode.size[1], -mode.bit_depth))
+
+
+def _widest(modes: Sequence[SensorMode]) -> list[SensorMode]:
+    """Those with the widest view; crops that differ by a few rows show the same."""
+    view = max(mode.area for mode in modes)
+    return [mode for mode in modes if mode.area >= 0.98 * view]
+
+
+def _listed(modes: Sequence[SensorMode]) -> str:
+    return "; ".join(mode.text(modes) for mode in modes) or "none"
 
 
 def choose_raw_mode(modes: Sequence[SensorMode], rate_hz: float, size: tuple[int, int]) -> SensorMode:
@@ -111,25 +116,14 @@ def choose_raw_mode(modes: Sequence[SensorMode], rate_hz: float, size: tuple[int
             "its sensor has colour filters, so that its values are a mosaic and no grey image: use a monochrome "
             "sensor (OV9281, OV7251, IMX296 mono), or, without an infrared filter before it, --luma"
         )
-    able = [
-        mode
-        for mode in modes
-        if mode.mono and mode.size == size and mode.rate_hz + ROUNDING_HZ >= rate_hz and mode.bit_depth >= 8
-    ]
+    able = [m for m in modes if m.mono and m.size == size and m.reaches(rate_hz) and m.bit_depth >= 8]
     if not able:
-        widest = max((mode.area for mode in modes), default=1)
-        listed = "; ".join(mode.text(widest) for mode in modes) or "none"
         raise CameraError(
-            f"no mode of the sensor is {size[0]}x{size[1]} at {rate_hz:g} Hz. It has: {listed}. A grey image is what "
-            "the sensor delivers, pixel by pixel: set width_px, height_px, frame_rate_hz of the camera file to a mode"
+            f"no mode of the sensor is {size[0]}x{size[1]} at {rate_hz:g} Hz. It has: {_listed(modes)}. A grey image "
+            "is what the sensor delivers, pixel by pixel: set width_px, height_px, frame_rate_hz of the camera file to "
+            "a mode"
         )
-    view = max(mode.area for mode in able)
-    return min((mode for mode in able if mode.area >= SAME_VIEW * view), key=lambda mode: mode.bit_depth)
-
-
-def view_text(mode: SensorMode, modes: Sequence[SensorMode]) -> str:
-    """The chosen mode in words, for the log."""
-    return mode.text(max(other.area for other in modes))
+    return min(_widest(able), key=lambda mode: mode.bit_depth)
 
 
 # Names of libcamera -> of the kernel; the others are packed or compressed, which nobody asked for.
@@ -151,14 +145,12 @@ class Streams:
     def parts(self) -> dict[str, Any]:
         """Streams and sensor mode of the configuration."""
         raw = {"format": f"R{self.mode.bit_depth}", "size": self.mode.size}
-        parts: dict[str, Any] = {
+        lores = {} if self.lores is None else {"lores": {"size": self.lores, "format": "YUV420"}}
+        return lores | {
             "main": {"size": self.size, "format": _MAIN[self.pixels]},
             "raw": raw if self.pixels is Pixels.GREY else None,
             "sensor": {"output_size": self.mode.size, "bit_depth": self.mode.bit_depth},
         }
-        if self.lores is not None:
-            parts["lores"] = {"size": self.lores, "format": "YUV420"}
-        return parts
 
     def taken(self, configuration: Mapping[str, Any]) -> "Streams":
         """The same with what the camera made of it; libcamera adjusts what it cannot do."""
@@ -177,8 +169,7 @@ class Streams:
                     f"{got[0][0]}x{got[0][1]} {got[1]} of it; use a size with even width and height"
                 )
         raw = configuration["raw"] if self.pixels is Pixels.GREY else None
-        named = None if raw is None else (str(raw["format"]), int(raw["stride"]))
-        return Streams(self.pixels, self.size, self.mode, self.lores, named)
+        return replace(self, raw=None if raw is None else (str(raw["format"]), int(raw["stride"])))
 
     def image(self, request: Request) -> Image:
         """The frame: (H, W, 3) BGR, or (H, W) grey; `RuntimeError`: of another size."""

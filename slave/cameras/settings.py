@@ -37,10 +37,10 @@ def differences(wanted: Iterable[Setting], got: Mapping[str, object]) -> list[st
     """What is not as wanted, or was not read back, one sentence each."""
     found: list[str] = []
     for setting in wanted:
+        unit = setting.unit
+        start = f"{setting.name}: wanted {_text_of(setting.wanted, unit)}"
         if setting.name not in got:
-            found.append(
-                f"{setting.name}: wanted {_text_of(setting.wanted, setting.unit)}, not read back at all"
-            )
+            found.append(f"{start}, not read back at all")
             continue
         values = as_values(got[setting.name])
         near = (
@@ -49,11 +49,9 @@ def differences(wanted: Iterable[Setting], got: Mapping[str, object]) -> list[st
             and all(abs(a - b) <= setting.tolerance for a, b in zip(values, setting.wanted, strict=True))
         )
         if not near:
-            text = got[setting.name] if values is None else _text_of(values, setting.unit)
-            found.append(
-                f"{setting.name}: wanted {_text_of(setting.wanted, setting.unit)} ({setting.source}), got {text}, "
-                f"allowed are {_number(setting.tolerance)}{_space(setting.unit)} off"
-            )
+            text = got[setting.name] if values is None else _text_of(values, unit)
+            allowed = _text_of((setting.tolerance,), unit)
+            found.append(f"{start} ({setting.source}), got {text}, allowed are {allowed} off")
     return found
 
 
@@ -85,15 +83,7 @@ def change(
 
 
 def _text_of(values: Sequence[float], unit: str) -> str:
-    return ", ".join(_number(value) for value in values) + _space(unit)
-
-
-def _number(value: float) -> str:
-    return f"{value:.6g}"
-
-
-def _space(unit: str) -> str:
-    return f" {unit}" if unit else ""
+    return ", ".join(f"{value:.6g}" for value in values) + (f" {unit}" if unit else "")
 
 
 T = TypeVar("T")

@@ -41,7 +41,7 @@ from slave.sources import Frame, Tunable
 
 
 @dataclass(frozen=True, slots=True)
-class _Pace:
+class _FrameTiming:
     """Exposure times: frame `seq` at `t_ns` [ns], the others at this rate."""
 
     seq: int
@@ -85,11 +85,16 @@ class SyntheticCamera(Tunable):
         self._renderer = renderer_of(scene, name, live=live)
         true = scene.cameras[name]
         camera = true if isinstance(camera, str) else camera
-        _refuse_other_size(camera, true)
+        size, true_size = ((one.width_px, one.height_px) for one in (camera, true))
+        if size != true_size:
+            raise CalibrationError(
+                f"camera {camera.name!r}: width_px, height_px: {size[0]} x {size[1]}, the simulated camera has "
+                f"{true_size[0]} x {true_size[1]}: write that into the camera file"
+            )
         self._lit_for, self._camera = true, true
         self._clock, self._true, self._sleep = clock, true_clock, sleep
         self._epoch_ns, self._lights = epoch_ns, lights
-        self._pace = _Pace(0, self._own(epoch_ns + start_offset_ns), camera.frame_rate_hz)
+        self._timing = _FrameTiming(0, self._own(epoch_ns + start_offset_ns), camera.frame_rate_hz)
         self._rows_ns = true.height_px * true.row_time_us * 1e3
         self._grey = scene.rig.kind == "wrist"
         self._cycle = len(STROBE) if isinstance(scene, WristScene) else 1
@@ -105,7 +110,7 @@ class SyntheticCamera(Tunable):
         if self._closed:
             return None
         seq = self._due_next()
-        t_ns = self._pace.exposed_ns(seq)
+        t_ns = self._timing.exposed_ns(seq)
         image, lit = self._draw(seq, t_ns)
         self._next = seq + 1
         due = self._true_ns(t_ns + self._readout_ns)
@@ -131,8 +136,8 @@ class SyntheticCamera(Tunable):
                 f"frame_rate_hz: wanted {rate_hz:g}, the rows of a frame are read out in {self._rows_ns * 1e-3:.0f} "
                 f"us, so at most {1e9 / self._rows_ns:.4g}; the settings before are still in use"
             )
-        if rate_hz != self._pace.rate_hz:  # the frame that is next comes when it would have come anyway
-            self._pace = _Pace(seq := self._next, self._pace.exposed_ns(seq), rate_hz)
+        if rate_hz != self._timing.rate_hz:  # the frame that is next comes when it would have come anyway
+            self._timing = _FrameTiming(seq := self._next, self._timing.exposed_ns(seq), rate_hz)
         gains_bgr = _sensitivity(camera) / _sensitivity(self._lit_for)
         self._camera, self._renderer = camera, self._renderer.exposed(camera.exposure_us, gains_bgr)
 
@@ -181,8 +186,8 @@ class SyntheticCamera(Tunable):
 
     def _due_next(self) -> int:
         """The next frame, or the first that is not yet read out; a strobe cycle is ended."""
-        late_ns = self._clock.now_ns() - self._readout_ns - self._pace.exposed_ns(self._next)
-        period_ns = 1e9 / self._pace.rate_hz
+        late_ns = self._clock.now_ns() - self._readout_ns - self._timing.exposed_ns(self._next)
+        period_ns = 1e9 / self._timing.rate_hz
         begun = self._started and self._next % self._cycle != 0
         if begun or late_ns <= (0.5 * period_ns if self._started else 0.0):
             self._started = True
@@ -199,15 +204,6 @@ class SyntheticCamera(Tunable):
 
     def _true_ns(self, t_ns: int) -> int:
         return self._clock.to_true(t_ns) if isinstance(self._clock, SkewedClock) else t_ns
-
-
-def _refuse_other_size(camera: CameraCalibration, true: CameraCalibration) -> None:
-    size, true_size = ((one.width_px, one.height_px) for one in (camera, true))
-    if size != true_size:
-        raise CalibrationError(
-            f"camera {camera.name!r}: width_px, height_px: {size[0]} x {size[1]}, the simulated camera has "
-            f"{true_size[0]} x {true_size[1]}: write that into the camera file"
-        )
 
 
 def _sensitivity(camera: CameraCalibration) -> Float:

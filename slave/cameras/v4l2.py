@@ -73,14 +73,13 @@ class V4l2Camera(Tunable):
         calibration: CameraCalibration,
         options: V4l2Options,
         clock: Clock,
-        open_device: Callable[[Path], abi.Device] = abi.KernelDevice,
+        open_device: Callable[[Path], abi.KernelDevice] = abi.KernelDevice,
     ) -> None:
         """Open and configure the camera, start it and check what it really does."""
         self._calibration, self._options, self._clock = calibration, options, clock
         self._where = f"camera {calibration.name!r} (v4l2:{options.path})"
         self._foreign: ForeignClock | None = None
-        interrupt_sigma_ns = 50e3  # see above
-        self._sigma_ns = interrupt_sigma_ns
+        self._sigma_ns = 50e3  # see above
         self._buffers: list[memoryview] = []
         self._seq = -1
         self._sequence: int | None = None
@@ -90,7 +89,7 @@ class V4l2Camera(Tunable):
         self._rate_hz = 0.0
         self._times = FrameObserver[tuple[int, int]]()  # number and time of frames
         self.broken = 0
-        self._device: abi.Device | None = self._open(open_device)
+        self._device: abi.KernelDevice | None = self._open(open_device)
         try:
             self._start(self._device)
         except CameraError as error:
@@ -148,34 +147,23 @@ class V4l2Camera(Tunable):
             raise CameraError(
                 f"{self._where}: exposure_us {camera.exposure_us:g} does not fit into a frame of {period_us:.0f} us"
             )
-        old = self._calibration
+        assert self._settings is not None  # the constructor opened it
         try:
-            for step in _steps(old, camera):
-                self._step(step)
+            self._settings.refuse_fixed(self._calibration, camera)
+            change(self._apply, self._calibration, camera)
         except CameraError as error:
-            self._step_back(old, error)
             raise CameraError(f"{self._where}: {error}") from error
 
-    def _step(self, camera: CameraCalibration) -> None:
-        """Change the rate alone, or the exposure alone."""
-        settings, before = self._settings, self._calibration
-        assert settings is not None  # the constructor opened it
-        if camera.frame_rate_hz != before.frame_rate_hz:
-            change(self._retime, before, camera)
-        else:
-            settings.tune(before, camera, self._times)
-        self._calibration = camera  # its exposure is in the time of every frame from now on
-
-    def _step_back(self, old: CameraCalibration, failed: CameraError) -> None:
-        """Have `old` again where the first of two steps was taken."""
-        if self._calibration is old:
-            return
-        try:
-            self._step(old)
-        except CameraError as error:
-            raise CameraError(
-                f"{self._where}: {failed}; and the settings before did not come back: {error}"
-            ) from error
+    def _apply(self, camera: CameraCalibration) -> None:
+        """Change the rate alone and the exposure alone, in the order that fits."""
+        assert self._settings is not None  # the constructor opened it
+        for step in _steps(self._calibration, camera):
+            # its exposure is in the time of every frame from now on
+            before, self._calibration = self._calibration, step
+            if step.frame_rate_hz != before.frame_rate_hz:
+                self._retime(step)
+            else:
+                self._settings.expose(step, self._times)
 
     def metrics(self) -> dict[str, float]:
         """Its settings and the rate measured at the start; nothing where it is gone."""
@@ -186,7 +174,7 @@ class V4l2Camera(Tunable):
         """`camera.broken`: frames that arrived damaged."""
         return {"camera.broken": self.broken}
 
-    def _open(self, open_device: Callable[[Path], abi.Device]) -> abi.Device:
+    def _open(self, open_device: Callable[[Path], abi.KernelDevice]) -> abi.KernelDevice:
         try:
             return open_device(self._options.path)
         except OSError as error:
@@ -198,7 +186,7 @@ class V4l2Camera(Tunable):
             }.get(error.errno or 0, f"devices here: {there}")
             raise CameraError(f"{self._where}: cannot be opened: {error.strerror}; {fix}") from error
 
-    def _start(self, device: abi.Device) -> None:
+    def _start(self, device: abi.KernelDevice) -> None:
         camera, options = self._calibration, self._options
         name = self._check_capabilities(device)
         size = (camera.width_px, camera.height_px)
@@ -213,14 +201,13 @@ class V4l2Camera(Tunable):
         settings.check(lambda: self._settle(device))
         _LOG.info("%s: %s, %s, %d settings checked", self._where, name, offer.text(), len(settings))
 
-    def _check_capabilities(self, device: abi.Device) -> str:
+    def _check_capabilities(self, device: abi.KernelDevice) -> str:
         found = abi.Capability()
         device.ioctl(abi.QUERYCAP, found)
         has = int(found.device_caps if found.capabilities & abi.V4L2.cap_device_caps else found.capabilities)
         name = found.card.decode("utf-8", "replace")
         if found.driver == b"uvcvideo":
-            usb_sigma_ns, usb_clock_sigma_ns = 1.2e6, 0.3e6  # see above
-            self._sigma_ns = usb_clock_sigma_ns if _usb_clock_is_used() else usb_sigma_ns
+            self._sigma_ns = 0.3e6 if _usb_clock_is_used() else 1.2e6  # see above
         if not (has & abi.V4L2.cap_capture and has & abi.V4L2.cap_streaming):
             raise CameraError(
                 f"{name} is no single-planar capture device (a USB camera has a second device for metadata; a Pi "
@@ -240,7 +227,7 @@ class V4l2Camera(Tunable):
                 f"frame_rate_hz: wanted {camera.frame_rate_hz:g}, frames come at {got_hz:.4g} Hz"
             )
 
-    def _set_rate(self, device: abi.Device, camera: CameraCalibration) -> None:
+    def _set_rate(self, device: abi.KernelDevice, camera: CameraCalibration) -> None:
         size, rate_hz = (camera.width_px, camera.height_px), camera.frame_rate_hz
         parameters = abi.StreamParameters(
             type=abi.V4L2.capture, numerator=1000, denominator=round(rate_hz * 1000)
@@ -260,7 +247,7 @@ class V4l2Camera(Tunable):
         if not Offer(0, size, (got_hz,)).reaches(rate_hz):
             raise CameraError(f"frame_rate_hz: wanted {rate_hz:g}, the driver set {got_hz:.4g}")
 
-    def _stream(self, device: abi.Device) -> None:
+    def _stream(self, device: abi.KernelDevice) -> None:
         request = abi.RequestBuffers(count=BUFFERS, type=abi.V4L2.capture, memory=abi.V4L2.mmap)
         device.ioctl(abi.REQBUFS, request)
         for index in range(int(request.count)):
@@ -271,7 +258,7 @@ class V4l2Camera(Tunable):
         device.ioctl(abi.STREAMON, c.c_int(abi.V4L2.capture))
         self._streaming = True
 
-    def _settle(self, device: abi.Device) -> None:
+    def _settle(self, device: abi.KernelDevice) -> None:
         """Take some frames, and see that they come at the rate that was asked for."""
         times: list[tuple[int, int]] = []
         for _ in range(SETTLE_FRAMES):
@@ -285,7 +272,7 @@ class V4l2Camera(Tunable):
                 f"{self._calibration.exposure_us:g} us may be too long, or the USB port too slow (two on one hub)"
             )
 
-    def _next(self, device: abi.Device) -> tuple[Image | None, abi.Buffer]:
+    def _next(self, device: abi.KernelDevice) -> tuple[Image | None, abi.Buffer]:
         """Newest frame (None: damaged) and its buffer, which the driver has back already."""
         layout = self._layout
         assert layout is not None  # the format is set before the stream starts
@@ -355,7 +342,7 @@ def _usb_clock_is_used() -> bool:
         return False
 
 
-def _take(device: abi.Device) -> abi.Buffer | None:
+def _take(device: abi.KernelDevice) -> abi.Buffer | None:
     """Dequeue a filled buffer, or None if there is none."""
     buffer = abi.Buffer(type=abi.V4L2.capture, memory=abi.V4L2.mmap)
     try:

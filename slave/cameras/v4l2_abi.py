@@ -12,7 +12,7 @@ import mmap
 import os
 import select
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 
 class V4l2(NamedTuple):
@@ -225,35 +225,15 @@ ENUM_FRAMEINTERVALS = _request(_READ | _WRITE, 75, c.sizeof(FrameIntervals))
 QUERY_EXT_CTRL = _request(_READ | _WRITE, 103, c.sizeof(QueryControl))
 
 
-class Device(Protocol):
-    """An open video device; all methods raise `OSError` as the kernel does."""
-
-    def ioctl(self, request: int, argument: c.Structure | c.c_int) -> None:
-        """Do one request; the kernel changes `argument` in place."""
-        ...
-
-    def map(self, length: int, offset: int) -> memoryview:
-        """Memory of one buffer."""
-        ...
-
-    def wait(self, timeout_s: float) -> bool:
-        """Whether a frame (or an error) is there within the time."""
-        ...
-
-    def close(self) -> None:
-        """Unmap and close. Safe to call twice."""
-        ...
-
-
 class KernelDevice:
-    """A `Device` of the running kernel."""
+    """An open video device; all methods raise `OSError` as the kernel does."""
 
     def __init__(self, path: Path) -> None:
         self._file: int | None = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
         self._maps: list[mmap.mmap] = []
 
     def ioctl(self, request: int, argument: c.Structure | c.c_int) -> None:
-        """Do one request."""
+        """Do one request; the kernel changes `argument` in place."""
         fcntl.ioctl(self._open(), request, argument)  # Python repeats it after a signal (PEP 475)
 
     def map(self, length: int, offset: int) -> memoryview:
@@ -268,7 +248,7 @@ class KernelDevice:
         return bool(poll.poll(timeout_s * 1e3))
 
     def close(self) -> None:
-        """Close the file; a map goes when nobody looks at it any more."""
+        """Close; a map goes when nobody looks at it any more. Safe to call twice."""
         self._maps.clear()
         if self._file is not None:
             os.close(self._file)

@@ -21,7 +21,7 @@ from common.calibration import CameraCalibration
 from common.errors import CameraError
 from slave.cameras import v4l2_abi as abi
 from slave.cameras.grey import Pixels
-from slave.cameras.settings import FrameObserver, Setting, change, demand, differences
+from slave.cameras.settings import FrameObserver, Setting, demand, differences
 
 EXPOSURE = "exposure_time_absolute"
 EXPOSURE_UNIT_US = 100.0
@@ -70,14 +70,10 @@ NEEDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "white_balance": (("white_balance_temperature",), ("red_balance", "blue_balance")),
 }
 FILE_KEYS = {"exposure": "exposure_us", "gain": "analogue_gain", "white_balance": "colour_gains"}
-NUMERIC = {
-    abi.V4L2.type_integer,
-    abi.V4L2.type_boolean,
-    abi.V4L2.type_menu,
-    abi.V4L2.type_integer64,
-    abi.V4L2.type_bitmask,
-    abi.V4L2.type_integer_menu,
-}
+_V = abi.V4L2
+_MENUS = {_V.type_menu, _V.type_integer_menu}
+NUMERIC = {_V.type_integer, _V.type_boolean, _V.type_integer64, _V.type_bitmask, *_MENUS}
+_USELESS = _V.ctrl_disabled | _V.ctrl_read_only | _V.ctrl_write_only | _V.ctrl_has_payload
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +106,7 @@ class Control:
         return self.low + round(steps) * self.step
 
 
-def read_controls(device: abi.Device) -> dict[str, Control]:
+def read_controls(device: abi.KernelDevice) -> dict[str, Control]:
     """All controls with a number that can be written and read back, by name."""
     found: dict[str, Control] = {}
     number = 0
@@ -123,24 +119,14 @@ def read_controls(device: abi.Device) -> dict[str, Control]:
                 return found
             raise
         number = int(query.id)
-        useless = (
-            abi.V4L2.ctrl_disabled
-            | abi.V4L2.ctrl_read_only
-            | abi.V4L2.ctrl_write_only
-            | abi.V4L2.ctrl_has_payload
-        )
-        if query.type in NUMERIC and not query.flags & useless:
+        if query.type in NUMERIC and not query.flags & _USELESS:
             name = NAMES.get(number) or plain_name(query.name.decode("ascii", "replace"))
-            menu = (
-                _menu(device, query)
-                if query.type in (abi.V4L2.type_menu, abi.V4L2.type_integer_menu)
-                else None
-            )
+            menu = _menu(device, query) if query.type in _MENUS else None
             low, high, step = int(query.minimum), int(query.maximum), max(int(query.step), 1)
             found[name] = Control(number, name, int(query.type), low, high, step, menu)
 
 
-def _menu(device: abi.Device, query: abi.QueryControl) -> dict[int, str]:
+def _menu(device: abi.KernelDevice, query: abi.QueryControl) -> dict[int, str]:
     found: dict[int, str] = {}
     for index in range(int(query.minimum), int(query.maximum) + 1):
         entry = abi.QueryMenu(id=query.id, index=index)
@@ -151,12 +137,10 @@ def _menu(device: abi.Device, query: abi.QueryControl) -> dict[int, str]:
                 continue
             raise
         label = bytes(entry.name)
-        number = str(int.from_bytes(label[:8], "little", signed=True))
-        found[index] = (
-            number
-            if query.type == abi.V4L2.type_integer_menu
-            else label.split(b"\0")[0].decode("ascii", "replace")
-        )
+        if query.type == abi.V4L2.type_integer_menu:
+            found[index] = str(int.from_bytes(label[:8], "little", signed=True))
+        else:
+            found[index] = label.split(b"\0")[0].decode("ascii", "replace")
     return found
 
 
@@ -238,7 +222,14 @@ def _check_needs(controls: Mapping[str, Control], given: Mapping[str, int], allo
         raise CameraError("; ".join(notes))
 
 
-def write(device: abi.Device, controls: Mapping[str, Control], settings: Iterable[Setting]) -> None:
+_REFUSED = {
+    errno.EBUSY: "another program is using it",
+    errno.EACCES: "it is read-only now",
+    errno.ERANGE: "out of range",
+}
+
+
+def write(device: abi.KernelDevice, controls: Mapping[str, Control], settings: Iterable[Setting]) -> None:
     """Write all settings, in order."""
     for setting in settings:
         control = controls[setting.name]
@@ -251,18 +242,12 @@ def write(device: abi.Device, controls: Mapping[str, Control], settings: Iterabl
         try:
             device.ioctl(abi.S_EXT_CTRLS, values)
         except OSError as error:
-            why = {
-                errno.EBUSY: "another program is using it",
-                errno.EACCES: "it is read-only now",
-                errno.ERANGE: "out of range",
-            }
-            raise CameraError(
-                f"{setting.name}={value} ({setting.source}) was refused: {why.get(error.errno or 0, error.strerror)}"
-            ) from error
+            why = _REFUSED.get(error.errno or 0, error.strerror)
+            raise CameraError(f"{setting.name}={value} ({setting.source}) was refused: {why}") from error
 
 
 def read_back(
-    device: abi.Device, controls: Mapping[str, Control], settings: Iterable[Setting]
+    device: abi.KernelDevice, controls: Mapping[str, Control], settings: Iterable[Setting]
 ) -> dict[str, int]:
     """Present values of the controls of `settings`, by name."""
     found: dict[str, int] = {}
@@ -290,14 +275,14 @@ class V4l2Settings:
 
     def __init__(
         self,
-        device: abi.Device,
+        device: abi.KernelDevice,
         camera: CameraCalibration,
         given: Mapping[str, int],
         missing: Iterable[str],
         pixels: Pixels = Pixels.COLOUR,
     ) -> None:
         """Write all settings, before the stream starts; arguments as of `plan`."""
-        self._device: abi.Device | None = device
+        self._device: abi.KernelDevice | None = device
         self._given, self._missing, self._pixels = given, tuple(missing), pixels
         self._controls = read_controls(device)
         self._wanted = plan(camera, self._controls, given, self._missing, pixels)
@@ -315,19 +300,16 @@ class V4l2Settings:
             settle()
         demand("it", self._wanted, read_back(self._device, self._controls, self._wanted), FIX)
 
-    def tune(
-        self, old: CameraCalibration, new: CameraCalibration, frames: FrameObserver[tuple[int, int]]
-    ) -> None:
-        """Change the exposure while the loop reads `frames`; see `Tunable.tune`."""
+    def refuse_fixed(self, old: CameraCalibration, new: CameraCalibration) -> None:
+        """Raise where settings differ that this camera cannot change."""
         fixed = [FILE_KEYS["gain"], FILE_KEYS["white_balance"]]
         if changed := [key for key in fixed if getattr(new, key) != getattr(old, key)]:
             raise CameraError(
                 f"{' and '.join(changed)} cannot be changed: with a USB camera they are codes of its maker, fixed at "
                 "the start by --control"
             )
-        if EXPOSURE not in self._controls:
+        if EXPOSURE not in self._controls and new.exposure_us != old.exposure_us:
             raise CameraError("exposure_us cannot be changed: the camera has no control for it")
-        change(lambda camera: self._apply(camera, frames), old, new)
 
     def metrics(self) -> dict[str, float]:
         """Exposure and codes as the camera has them now; nothing where it is gone."""
@@ -346,12 +328,8 @@ class V4l2Settings:
         with self._asking:
             self._device = None
 
-    def _apply(self, camera: CameraCalibration, frames: FrameObserver[tuple[int, int]]) -> None:
-        period_us = 1e6 / camera.frame_rate_hz
-        if camera.exposure_us >= period_us:
-            raise CameraError(
-                f"exposure_us {camera.exposure_us:g} does not fit into a frame of {period_us:.0f} us"
-            )
+    def expose(self, camera: CameraCalibration, frames: FrameObserver[tuple[int, int]]) -> None:
+        """Change the exposure while the loop reads `frames`; see `Tunable.tune`."""
         controls = self._controls
         wanted = plan(camera, controls, self._given, self._missing, self._pixels)
         exposure = [setting for setting in wanted if setting.name == EXPOSURE]
@@ -361,7 +339,7 @@ class V4l2Settings:
         demand("it", wanted, self.ask(lambda device: read_back(device, controls, wanted)), FIX)
         self._wanted = wanted
 
-    def ask(self, question: Callable[[abi.Device], T]) -> T:
+    def ask(self, question: Callable[[abi.KernelDevice], T]) -> T:
         """What the open device answers, from any thread."""
         with self._asking:
             if self._device is None:

@@ -18,7 +18,7 @@ from common.arrays import Image
 from common.errors import CameraError, PictureError
 from common.recording.pictures import decode
 from slave.cameras import v4l2_abi as abi
-from slave.cameras.grey import GREY_FORMATS, JPEG_FORMATS, LUMA_FORMATS, Pixels, grey, luma
+from slave.cameras.grey import GREY_FORMATS, JPEG_FORMATS, LUMA_FORMATS, Pixels, grey, luma, rows_of
 
 PREFERENCE = {
     Pixels.COLOUR: ("BGR3", "RGB3", "YUYV", "UYVY", *JPEG_FORMATS),
@@ -49,8 +49,7 @@ class Offer:
         """Whether this rate [Hz] is offered; a driver that lists none may reach it."""
         if not self.rates_hz:
             return True
-        rate_share = 0.01  # 59.94 Hz serves 60 Hz
-        slack = rate_share * rate_hz
+        slack = 0.01 * rate_hz  # 59.94 Hz serves 60 Hz
         if self.continuous:
             return self.rates_hz[0] - slack <= rate_hz <= self.rates_hz[-1] + slack
         return any(abs(offered - rate_hz) <= slack for offered in self.rates_hz)
@@ -62,16 +61,16 @@ class Offer:
         return f"{abi.fourcc_text(self.pixel_format)} {self.size[0]}x{self.size[1]} at {rates} Hz"
 
 
-def read_offers(device: abi.Device, wanted: tuple[int, int]) -> tuple[Offer, ...]:
+def read_offers(device: abi.KernelDevice, wanted: tuple[int, int]) -> tuple[Offer, ...]:
     """All formats, sizes and rates; of a range of sizes its ends and the wanted one."""
-    offers: list[Offer] = []
-    for description in _enumerate(
+    formats = _enumerate(
         device, abi.ENUM_FMT, lambda i: abi.FormatDescription(index=i, type=abi.V4L2.capture)
-    ):
-        pixel_format = int(description.pixelformat)
-        for size in _sizes(device, pixel_format, wanted):
-            offers.append(_with_rates(device, pixel_format, size))
-    return tuple(offers)
+    )
+    return tuple(
+        _with_rates(device, int(one.pixelformat), size)
+        for one in formats
+        for size in _sizes(device, int(one.pixelformat), wanted)
+    )
 
 
 def choose_offer(
@@ -120,7 +119,7 @@ class Layout:
             return None  # the caller counts it as broken
 
 
-def set_format(device: abi.Device, offer: Offer, pixels: Pixels) -> Layout:
+def set_format(device: abi.KernelDevice, offer: Offer, pixels: Pixels) -> Layout:
     """Set size and format, and see what the driver made of them."""
     asked = abi.Format(type=abi.V4L2.capture)
     pix = asked.fmt.pix
@@ -137,10 +136,9 @@ def set_format(device: abi.Device, offer: Offer, pixels: Pixels) -> Layout:
 
 def _colours(raw: Image, name: str, size: tuple[int, int], stride: int) -> Image | None:
     width, height = size
-    used = width * (3 if name in ("BGR3", "RGB3") else 2)
-    if raw.size < stride * (height - 1) + used or stride < used:
+    rows = rows_of(raw, height, stride, width * (3 if name in ("BGR3", "RGB3") else 2))
+    if rows is None:
         return None
-    rows = np.lib.stride_tricks.as_strided(raw, (height, used), (stride, 1), writeable=False)
     if name == "BGR3":
         return rows.reshape(height, width, 3).copy()
     if name == "RGB3":
@@ -149,23 +147,20 @@ def _colours(raw: Image, name: str, size: tuple[int, int], stride: int) -> Image
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(rows).reshape(height, width, 2), code), np.uint8)
 
 
-def _enumerate(device: abi.Device, request: int, entry: Callable[[int], EntryT]) -> Iterator[EntryT]:
+def _enumerate(device: abi.KernelDevice, request: int, entry: Callable[[int], EntryT]) -> Iterator[EntryT]:
     """Yield the entries 0, 1, … until the driver reports that there is no more."""
     for index in range(256):  # a driver that never ends its enumeration is broken
         item = entry(index)
         try:
             device.ioctl(request, item)
         except OSError as error:
-            if error.errno in (
-                errno.EINVAL,
-                errno.ENOTTY,
-            ):  # the end; or the driver does not enumerate this at all
+            if error.errno in (errno.EINVAL, errno.ENOTTY):  # the end; or it does not enumerate this at all
                 return
             raise
         yield item
 
 
-def _sizes(device: abi.Device, pixel_format: int, wanted: tuple[int, int]) -> list[tuple[int, int]]:
+def _sizes(device: abi.KernelDevice, pixel_format: int, wanted: tuple[int, int]) -> list[tuple[int, int]]:
     found: list[tuple[int, int]] = []
     for entry in _enumerate(
         device, abi.ENUM_FRAMESIZES, lambda i: abi.FrameSizes(index=i, pixel_format=pixel_format)
@@ -184,7 +179,7 @@ def _on_grid(value: int, low: int, high: int, step: int) -> bool:
     return low <= value <= high and (value - low) % max(step, 1) == 0
 
 
-def _with_rates(device: abi.Device, pixel_format: int, size: tuple[int, int]) -> Offer:
+def _with_rates(device: abi.KernelDevice, pixel_format: int, size: tuple[int, int]) -> Offer:
     rates: list[float] = []
     width, height = size
     for entry in _enumerate(

@@ -10,7 +10,6 @@ from slave.drivers import CAMERAS, IMU_UNITS, IMUS, LIGHTS, REAL_IMUS, SCANS, SW
 
 BEACON_PORT = 47800
 BOTH = "grasp | both-poses | both-curl | both-travel | both-moves | gestures"  # the same motion for both kinds of rig
-_finite = number()
 
 
 def add_place(command: ArgumentParser, who: str, calibration: str = "calib_json", rig: str = "desk") -> None:
@@ -56,34 +55,20 @@ def add_camera(command: ArgumentParser) -> None:
         "monochrome sensor; it is not linear in the light",
     )
     pi = command.add_argument_group("Pi camera (picamera2)").add_argument
-    pi(
-        "--sync",
-        choices=("off", "server", "client"),
-        default="off",
-        help="frames in step with other Pi cameras: one leads, the others follow; start clients first",
-    )
-    pi(
-        "--sync-timeout",
-        type=float,
-        default=60.0,
-        metavar="S",
-        help="how long to wait for them (default: %(default)s)",
-    )
+    text = "frames in step with other Pi cameras: one leads, the others follow; start clients first"
+    pi("--sync", choices=("off", "server", "client"), default="off", help=text)
+    text = "how long to wait for them (default: %(default)s)"
+    pi("--sync-timeout", type=float, default=60.0, metavar="S", help=text)
     usb = command.add_argument_group("USB camera (v4l2)").add_argument
-    usb(
-        "--control",
-        action="append",
-        default=[],
-        metavar="NAME=N",
-        help="fix a control in codes of its maker, for example gain=32; may be repeated",
-    )
-    usb(
-        "--allow-missing",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="exposure | gain | white_balance: the camera lacks this control, and that is known; may be repeated",
-    )
+    for name, metavar, text in (
+        ("--control", "NAME=N", "fix a control in codes of its maker, for example gain=32"),
+        (
+            "--allow-missing",
+            "NAME",
+            "exposure | gain | white_balance: the camera lacks this control, and that is known",
+        ),
+    ):
+        usb(name, action="append", default=[], metavar=metavar, help=f"{text}; may be repeated")
 
 
 def add_simulated(command: ArgumentParser) -> None:
@@ -107,27 +92,12 @@ def add_simulated(command: ArgumentParser) -> None:
     )
     add("--truth-rig", metavar="NAME", help="the rig in it, a file in DIR/rigs (default: of the same name)")
     add("--scene-epoch-ns", type=int, metavar="N", help="CLOCK_MONOTONIC at scene time 0; default: now")
-    add(
-        "--clock-offset-ms",
-        type=_finite,
-        default=0.0,
-        metavar="X",
-        help="this machine's clock is ahead (default: %(default)g)",
-    )
-    add(
-        "--clock-ppm",
-        type=_finite,
-        default=0.0,
-        metavar="Y",
-        help="and gains on the true one (default: %(default)g)",
-    )
-    add(
-        "--start-offset-ms",
-        type=_finite,
-        default=0.0,
-        metavar="Z",
-        help="frames of a synthetic camera come later (default: %(default)g)",
-    )
+    for name, metavar, text in (
+        ("--clock-offset-ms", "X", "this machine's clock is ahead"),
+        ("--clock-ppm", "Y", "and gains on the true one"),
+        ("--start-offset-ms", "Z", "frames of a synthetic camera come later"),
+    ):
+        add(name, type=number(), default=0.0, metavar=metavar, help=f"{text} (default: %(default)g)")
 
 
 def run(command: ArgumentParser) -> None:
@@ -239,13 +209,8 @@ def _add_detection(command: ArgumentParser) -> None:
         help="keep raw frames there, lossless, while it tracks, when `phalanx record FILE --raw` asks for them: a new "
         "folder each time (docs/recording.md)",
     )
-    add(
-        "--raw-reserve-mb",
-        type=megabytes,
-        default=200.0,
-        metavar="MB",
-        help="stay free on its disk (default: %(default)g)",
-    )
+    text = "stay free on its disk (default: %(default)g)"
+    add("--raw-reserve-mb", type=megabytes, default=200.0, metavar="MB", help=text)
     add(
         "--faults",
         type=Path,
@@ -319,12 +284,9 @@ def record(command: ArgumentParser) -> None:
         "scene need the same --scene-epoch-ns",
     )
     command.add_argument("--note", default="", metavar="TEXT", help="kept in recording.json")
-    command.add_argument(
-        "--reserve-mb", type=megabytes, default=200.0, metavar="MB", help="stay free (default: %(default)g)"
-    )
-    command.add_argument(
-        "--queue-mb", type=megabytes, default=128.0, metavar="MB", help="may wait (default: %(default)g)"
-    )
+    for name, default, text in (("--reserve-mb", 200.0, "stay free"), ("--queue-mb", 128.0, "may wait")):
+        text = f"{text} (default: %(default)g)"
+        command.add_argument(name, type=megabytes, default=default, metavar="MB", help=text)
     command.add_argument(
         "--by-wall-clock",
         action="store_true",
@@ -341,12 +303,8 @@ def record(command: ArgumentParser) -> None:
     for measured, units in IMU_UNITS.items():
         text = f"unit of {measured} where the header does not say it"
         table(f"--{measured}-unit", choices=units, help=text)
-    table(
-        "--rate-hz",
-        type=positive,
-        metavar="HZ",
-        help="samples per second of a table without a column of time",
-    )
+    text = "samples per second of a table without a column of time"
+    table("--rate-hz", type=positive, metavar="HZ", help=text)
     add_camera(command)
     add_simulated(command)
 
@@ -384,35 +342,20 @@ def colours(command: ArgumentParser) -> None:
         metavar="MARKER=U,V",
         help="a pixel on a marker in the first picture, column and row from the top left; once for each marker",
     )
-    command.add_argument(
-        "--calibration",
-        type=Path,
-        metavar="DIR",
-        help="of a video or pictures: calib_json tree with the camera",
+    text = "from all frames though there are clicks, which then only name paints"
+    command.add_argument("--auto", action="store_true", help=text)
+    text = "of a video or pictures: rig in DIR/rigs (default: the one with the camera)"
+    command.add_argument("--rig", metavar="NAME", help=text)
+    by_shape = (
+        "from all frames; names by the shape of this hand, which checks those of --like "
+        "(default: calib_json/hands/, the rig's hand)"
     )
-    command.add_argument(
-        "--rig",
-        metavar="NAME",
-        help="of a video or pictures: rig in DIR/rigs (default: the one with the camera)",
-    )
-    command.add_argument(
-        "--auto",
-        action="store_true",
-        help="from all frames though there are clicks, which then only name paints",
-    )
-    command.add_argument(
-        "--like",
-        type=Path,
-        metavar="CAMERA.json",
-        help="from all frames; names by the hues of this camera file",
-    )
-    command.add_argument(
-        "--hand",
-        type=Path,
-        metavar="HAND.json",
-        help="from all frames; names by the shape of this hand, which checks those of --like "
-        "(default: calib_json/hands/, the rig's hand)",
-    )
+    for name, metavar, text in (
+        ("--calibration", "DIR", "of a video or pictures: calib_json tree with the camera"),
+        ("--like", "CAMERA.json", "from all frames; names by the hues of this camera file"),
+        ("--hand", "HAND.json", by_shape),
+    ):
+        command.add_argument(name, type=Path, metavar=metavar, help=text)
     command.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FILE", help="camera file to write"
     )
@@ -458,15 +401,10 @@ def doctor(command: ArgumentParser) -> None:
     """
     command.add_argument("--name", help="slave to look at (default: all that are installed here)")
     command.add_argument("--rig", metavar="NAME", help="its rig (default: as installed; with --lights wrist)")
-    command.add_argument(
-        "--camera", metavar="DRIVER", help="its camera, as `run` has it (default: as installed)"
-    )
-    command.add_argument(
-        "--calibration",
-        type=Path,
-        metavar="DIR",
-        help="calib_json (default: as installed; with --lights calib_json)",
-    )
+    text = "its camera, as `run` has it (default: as installed)"
+    command.add_argument("--camera", metavar="DRIVER", help=text)
+    text = "calib_json (default: as installed; with --lights calib_json)"
+    command.add_argument("--calibration", type=Path, metavar="DIR", help=text)
     command.add_argument("--keys", type=Path, metavar="DIR", help="keys folder (default: /etc/phalanx/keys)")
     command.add_argument("--master", metavar="HOST", help="the PC whose beacon and clock are expected")
     command.add_argument(

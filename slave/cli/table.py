@@ -9,46 +9,22 @@ request, while somebody looks.
 
   phalanx-slave run --name left --rig desk --camera picamera2 --keys keys
   sudo phalanx-slave doctor           what of this device is well, and what is not"""
+_TABLE = (
+    Command("run", "run", "detect or measure live, and send",
+            "slave.cli.options:run", "slave.commands.run:run"),
+    Command("record", "record", "raw frames to disk; or a recording of several, or of your own videos",
+            "slave.cli.options:record", "slave.commands.record:run"),
+    Command("colours", "set up", "colours of the markers of a camera, from a recording",
+            "slave.cli.options:colours", "slave.commands.offline:run"),
+    Command("doctor", "set up", "what of this device is well, and what is not; test of its lights",
+            "slave.cli.options:doctor", "slave.doctor.command:run"),
+    Command("install", "set up", "install it as a service of this machine",
+            "slave.install.arguments:add_install", "slave.install.command:run_here"),
+)  # fmt: skip
 PROGRAM = Program(
     "phalanx-slave",
     ABOUT,
-    (
-        Command(
-            "run",
-            "run",
-            "detect or measure live, and send",
-            "slave.cli.options:run",
-            "slave.commands.run:run",
-        ),
-        Command(
-            "record",
-            "record",
-            "raw frames to disk; or a recording of several, or of your own videos",
-            "slave.cli.options:record",
-            "slave.commands.record:run",
-        ),
-        Command(
-            "colours",
-            "set up",
-            "colours of the markers of a camera, from a recording",
-            "slave.cli.options:colours",
-            "slave.commands.offline:run",
-        ),
-        Command(
-            "doctor",
-            "set up",
-            "what of this device is well, and what is not; test of its lights",
-            "slave.cli.options:doctor",
-            "slave.doctor.command:run",
-        ),
-        Command(
-            "install",
-            "set up",
-            "install it as a service of this machine",
-            "slave.install.arguments:add_install",
-            "slave.install.command:run_here",
-        ),
-    ),
+    _TABLE,
     "install it: pip install '.[wrist,fast,vive]' has what lights, numba and trackers need",
     "%(asctime)s %(name)s: %(message)s",
 )

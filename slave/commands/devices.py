@@ -2,30 +2,37 @@
 
 None is chosen silently: a name that is not in `slave.drivers`, or a place that is not of its form, is an error of the
 device's class that lists what there is. A driver is imported where it is opened, so other commands start without its
-library. What simulates or replays a device is opened by its command, which knows the scene. What is no recording is
-opened again when it was lost, until `stop` is set; `connection_lost` is called when that, or opening, takes time.
+library. What is no recording is opened again when it was lost, until `stop` is set; `connection_lost` is called when
+that, or opening, takes time.
 """
 
 import argparse
 import threading
+import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from common.calibration import CameraCalibration, ImuCalibration, RigCalibration, load
 from common.calibration.object_profile import ObjectProfile
 from common.calibration.strobe import StrobeCalibration
-from common.clock import Clock
+from common.clock import Clock, SkewedClock, SystemClock
 from common.errors import CalibrationError, CameraError, ImuError, LightsError, PhalanxError, TrackerError
 from common.imu.fusion import OrientationFilter
 from slave.cameras.grey import Pixels
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options, device_path
-from slave.drivers import IMUS, LIGHTS, REAL_IMUS, REAL_TRACKERS, SWITCHED_LIGHTS, TRACKERS
+from slave.commands.options import clock_of, world_of
+from slave.drivers import CAMERAS, IMUS, LIGHTS, REAL_IMUS, REAL_TRACKERS, SWITCHED_LIGHTS, TRACKERS
 from slave.lights.interlock import Interlock
 from slave.reconnect import ReconnectingCamera, ReconnectingDriver, ReconnectingTracker
 from slave.service import LOST_PATIENCE_S, ConnectionLost, ConnectionLostFor, nobody
 from slave.sources import FrameSource, ImuSource, TrackerSource
+
+if TYPE_CHECKING:
+    from slave.lights.strobed import SimulatedStrobe
 
 SYNTHETIC = "synthetic"
 REAL_CAMERAS = ("picamera2", "v4l2")
@@ -89,48 +96,171 @@ def open_camera(
         opener = lambda file: V4l2Camera(file, usb, clock)  # noqa: E731
     else:
         return None
-    return reconnecting_camera(opener, camera, clock, stop, lambda what: connection_lost(what, patience_s))
+    return _reconnecting(opener, camera, clock, stop, lambda what: connection_lost(what, patience_s))
 
 
-def reconnecting_camera(
+def _reconnecting(
     opener: Callable[[CameraCalibration], FrameSource],
     camera: CameraCalibration,
     clock: Clock,
     stop: threading.Event | None,
     connection_lost: ConnectionLost,
 ) -> FrameSource:
-    """Open a camera that is opened again until `stop` is set; None: loss is an error."""
     if stop is None:
         return opener(camera)
     return ReconnectingCamera(opener, camera, clock, stop, connection_lost)
 
 
-def open_imu(
-    name: str,
-    driver: str,
-    rate_hz: float,
-    clock: Clock,
-    stop: threading.Event,
-    connection_lost: ConnectionLost = nobody,
-) -> ImuSource:
-    """Open the IMU that `--imu` names; `rate_hz` is what the rig needs."""
-    kind, place = driver_of("--imu", driver, IMUS, ImuError)
-    opener: Callable[[], ImuSource]
-    if kind == "ximu3":
-        from slave.imu import ximu3
+@dataclass(frozen=True, slots=True)
+class Drivers:
+    """Opens the devices, real or not, that the options of a command name for a rig.
 
-        port = ximu3.SerialPlace.of(place)
-        true_hz = ximu3.SAMPLE_RATE_HZ / ximu3.divisor(rate_hz)
-        opener = lambda: ximu3.Ximu3Imu(name, port, rate_hz, clock, stop)  # noqa: E731
-    elif kind == "lsm6dsox":
-        from slave.imu import lsm6dsox
+    Attributes:
+        clock: The slave's.
+        true_clock: The machine's, or that of a scene that waits for who draws it.
+        stop: Ends the waiting for a lost device; None: losing the camera is an error.
+    """
 
-        wires = lsm6dsox.I2cPlace.of(place)
-        true_hz = lsm6dsox.rate_of(rate_hz).rate_hz
-        opener = lambda: lsm6dsox.Lsm6dsoxImu(name, wires, rate_hz, clock, stop)  # noqa: E731
-    else:
-        raise ImuError(f"--imu {driver}: is no real IMU; there are {REAL_IMUS}")
-    return ReconnectingDriver("IMU", opener, clock, stop, connection_lost, rate_hz=true_hz)
+    options: argparse.Namespace
+    rig: RigCalibration
+    clock: SkewedClock
+    true_clock: Clock
+    stop: threading.Event | None = None
+    connection_lost: ConnectionLostFor = nobody
+
+    @classmethod
+    def running(
+        cls,
+        options: argparse.Namespace,
+        rig: RigCalibration,
+        stop: threading.Event,
+        connection_lost: ConnectionLostFor,
+    ) -> "Drivers":
+        """Those of a slave that runs until `stop`."""
+        true_clock = SystemClock()
+        return cls(options, rig, clock_of(options, true_clock), true_clock, stop, connection_lost)
+
+    @property
+    def epoch_ns(self) -> int:
+        """Scene time 0 on the true clock [ns]."""
+        epoch_ns: int | None = self.options.scene_epoch_ns
+        return self.true_clock.now_ns() if epoch_ns is None else epoch_ns
+
+    def camera(self, camera: CameraCalibration) -> FrameSource:
+        """Open the camera, and before it, dark, the lights of a wrist device."""
+        rig, lights = self.rig, choose_lights(self.options.lights, self.rig, str(self.options.camera))
+        # a simulated board is not lit
+        if lights is None or (lights == SYNTHETIC and self.options.scene == "board"):
+            return self._camera(camera)
+        from slave.lights.controller import StrobeController
+        from slave.lights.strobed import SimulatedStrobe, StrobedCamera, schedule_of
+
+        limits, schedule = light_limits(lights, rig), schedule_of(rig, camera)
+        if lights == SYNTHETIC:
+            strobe = SimulatedStrobe(schedule, limits)
+            return StrobedCamera(self._camera(camera, strobe), camera, rig, strobe)
+        interlock = open_lights(lights, rig)
+        try:
+            source = self._camera(camera)
+        except Exception:
+            interlock.close()
+            raise
+        return StrobedCamera(source, camera, rig, StrobeController(schedule, interlock, self.clock))
+
+    def _camera(self, camera: CameraCalibration, lights: "SimulatedStrobe | None" = None) -> FrameSource:
+        options, clock, wrist = self.options, self.clock, self.rig.kind == "wrist"
+        driver, stop = str(options.camera), self.stop
+        found = open_camera(
+            driver, options, camera, clock, stop, wrist=wrist, connection_lost=self.connection_lost
+        )
+        if found is not None:
+            return found
+        kind, _, folder = driver.partition(":")
+        if kind == "replay" and folder:
+            from slave.cameras.replay import ReplayCamera
+
+            return ReplayCamera(Path(folder), options.name, paced=True, clock=clock)
+        if kind != SYNTHETIC or folder:
+            raise CameraError(f"--camera {driver}: no such driver; there are {CAMERAS}")
+        from slave.cameras.synthetic import FaultyCamera, Frozen, SyntheticCamera
+        from slave.commands.simulated import FrameClock, scene_of
+
+        scene, epoch_ns = scene_of(*world_of(options, self.rig)), self.epoch_ns
+        late_ns = round(options.start_offset_ms * 1e6)
+        waits = isinstance(self.true_clock, FrameClock)
+        sleep = self.true_clock.sleep if isinstance(self.true_clock, FrameClock) else time.sleep
+
+        def draw(file: CameraCalibration) -> SyntheticCamera:
+            return SyntheticCamera(
+                scene, file, epoch_ns, clock, late_ns, self.true_clock, sleep, lights, live=not waits
+            )
+
+        if getattr(options, "faults", None) is None:
+            return draw(camera)
+        frozen = Frozen()
+        return _reconnecting(
+            lambda file: FaultyCamera(draw(file), file, options.faults, frozen),
+            camera,
+            clock,
+            stop,
+            self._lost,
+        )
+
+    def _lost(self, what: str) -> None:
+        self.connection_lost(what, LOST_PATIENCE_S)
+
+    def imu(self, imu: ImuCalibration) -> ImuSource:
+        """Open the IMU of the rig, at the rate that this needs."""
+        clock, stop = self.clock, threading.Event() if self.stop is None else self.stop
+        if self.options.imu == SYNTHETIC:
+            from slave.commands.simulated import SyntheticSensor, imu_of
+
+            sensor = imu_of(SYNTHETIC, *world_of(self.options, self.rig))
+            return SyntheticSensor(sensor.sample, sensor.rate_hz, self.epoch_ns, clock, stop)
+        kind, place = driver_of("--imu", self.options.imu, IMUS, ImuError)
+        opener: Callable[[], ImuSource]
+        if kind == "ximu3":
+            from slave.imu import ximu3
+
+            port = ximu3.SerialPlace.of(place)
+            true_hz = ximu3.SAMPLE_RATE_HZ / ximu3.divisor(imu.rate_hz)
+            opener = lambda: ximu3.Ximu3Imu(imu.name, port, imu.rate_hz, clock, stop)  # noqa: E731
+        elif kind == "lsm6dsox":
+            from slave.imu import lsm6dsox
+
+            wires = lsm6dsox.I2cPlace.of(place)
+            true_hz = lsm6dsox.rate_of(imu.rate_hz).rate_hz
+            opener = lambda: lsm6dsox.Lsm6dsoxImu(imu.name, wires, imu.rate_hz, clock, stop)  # noqa: E731
+        else:
+            raise ImuError(f"--imu {self.options.imu}: is no real IMU; there are {REAL_IMUS}")
+        return ReconnectingDriver("IMU", opener, clock, stop, self._lost, rate_hz=true_hz)
+
+    def tracker(self, profile: ObjectProfile) -> TrackerSource:
+        """Open the tracker on an object."""
+        options, clock, name, serial = self.options, self.clock, self.options.name, self.options.serial
+        stop = threading.Event() if self.stop is None else self.stop
+        if options.tracker == SYNTHETIC:
+            from slave.commands.simulated import TRACKER_HZ, SyntheticSensor, poses_of, tracker_of
+
+            measure = poses_of(name, tracker_of(*world_of(options, self.rig), profile))
+            return SyntheticSensor(measure, TRACKER_HZ, self.epoch_ns, clock, stop)
+        kind, path = driver_of("--tracker", options.tracker, TRACKERS, TrackerError)
+        opener: Callable[[], TrackerSource]
+        if kind == "survive" and path:
+            from slave.objects.survive import SurviveFile
+
+            return SurviveFile(name, serial, Path(path), clock, stop)
+        if kind == "survive":
+            from slave.objects.survive import SurviveTracker
+
+            opener = lambda: SurviveTracker(name, serial, clock, stop, options.program)  # noqa: E731
+        elif kind == "openvr":
+            from slave.objects.openvr_tracker import OpenVrTracker
+
+            opener = lambda: OpenVrTracker(name, serial, clock, stop)  # noqa: E731
+        else:
+            raise TrackerError(f"--tracker {options.tracker}: is no real tracker; there are {REAL_TRACKERS}")
+        return ReconnectingTracker(name, opener, clock, stop, self._lost)
 
 
 def imu_places() -> str:
@@ -150,35 +280,6 @@ def orientation_of(imu: ImuCalibration) -> OrientationFilter:
             "heading that means anything in the rig: set it to null, then tilt alone is used"
         )
     return OrientationFilter(imu.rate_hz)
-
-
-def open_tracker(
-    name: str,
-    device: str,
-    serial: str | None,
-    program: str,
-    clock: Clock,
-    stop: threading.Event,
-    connection_lost: ConnectionLost = nobody,
-) -> TrackerSource:
-    """Open the tracker that `--tracker` names; `program` is survive-cli."""
-    kind, path = driver_of("--tracker", device, TRACKERS, TrackerError)
-    opener: Callable[[], TrackerSource]
-    if kind == "survive" and path:
-        from slave.objects.survive import SurviveFile
-
-        return SurviveFile(name, serial, Path(path), clock, stop)
-    if kind == "survive":
-        from slave.objects.survive import SurviveTracker
-
-        opener = lambda: SurviveTracker(name, serial, clock, stop, program)  # noqa: E731
-    elif kind == "openvr":
-        from slave.objects.openvr_tracker import OpenVrTracker
-
-        opener = lambda: OpenVrTracker(name, serial, clock, stop)  # noqa: E731
-    else:
-        raise TrackerError(f"--tracker {device}: is no real tracker; there are {REAL_TRACKERS}")
-    return ReconnectingTracker(name, opener, clock, stop, connection_lost)
 
 
 def object_with(calibration: Path, rig: RigCalibration, name: str) -> ObjectProfile:

@@ -24,7 +24,6 @@ from common.recording.frame_recording import (
     FrameRecording,
     FrameRow,
     Manifest,
-    RecordedClock,
     open_recording,
 )
 from common.recording.frame_writing import RecordingWriter, refuse_occupied
@@ -55,19 +54,14 @@ def join_recordings(
     _check_overlap(parts, shifts_ns)
     samples = _imu(parts, shifts_ns)
     manifest, owners = _manifest(parts)
+    frames: list[tuple[int, FrameRow, Path]] = []
     for part, shift_ns in zip(parts, shifts_ns, strict=True):
-        if any(abs(row.t_ns + shift_ns) > MAX_TIME_NS for row in part.rows):
+        frames += [(row.t_ns + shift_ns, row, part.folder / row.file) for row in part.rows]
+        if any(abs(t_ns) > MAX_TIME_NS for t_ns, _, _ in frames):
             raise RecordingError(
                 f"{part.folder}: its times on the clock of {first.folder} are beyond any clock"
             )
-    frames = sorted(
-        (
-            (row.t_ns + shift_ns, row, part.folder / row.file)
-            for part, shift_ns in zip(parts, shifts_ns, strict=True)
-            for row in part.rows
-        ),
-        key=lambda frame: (frame[0], frame[1].camera),
-    )
+    frames.sort(key=lambda frame: (frame[0], frame[1].camera))
     _check_space(output, [path for _, _, path in frames])
     _write(RecordingWriter(output, manifest), frames, progress)
     if samples:
@@ -186,7 +180,12 @@ def _owners(parts: Sequence[FrameRecording]) -> dict[str, FrameRecording]:
 
 def _shift_ns(first: FrameRecording, part: FrameRecording, by_wall_clock: bool) -> int:
     """What to add to the times of `part` to have them on the clock of `first` [ns]."""
-    ours, theirs = _clock(first), _clock(part)
+    ours, theirs = first.manifest.clock, part.manifest.clock
+    if ours is None or theirs is None:
+        raise RecordingError(
+            f"{(first if ours is None else part).folder}/recording.json: clock: missing; the clock of its times is "
+            "unknown"
+        )
     if ours.id == theirs.id:
         return 0
     if not by_wall_clock:
@@ -197,24 +196,13 @@ def _shift_ns(first: FrameRecording, part: FrameRecording, by_wall_clock: bool) 
     return theirs.wall_ahead_ns - ours.wall_ahead_ns
 
 
-def _clock(part: FrameRecording) -> RecordedClock:
-    if part.manifest.clock is None:
-        raise RecordingError(
-            f"{part.folder}/recording.json: clock: missing; the clock of its times is unknown"
-        )
-    return part.manifest.clock
-
-
 def _check_overlap(parts: Sequence[FrameRecording], shifts_ns: Sequence[int]) -> None:
-    spans = [
-        (min(row.t_ns for row in part.rows) + shift, max(row.t_ns for row in part.rows) + shift, part.folder)
-        for part, shift in zip(parts, shifts_ns, strict=True)
-    ]
-    late, early = max(spans, key=lambda span: span[0]), min(spans, key=lambda span: span[1])
-    if late[0] > early[1]:
+    both = list(zip(parts, shifts_ns, strict=True))
+    begin_ns, late = max((min(r.t_ns for r in part.rows) + shift, part.folder) for part, shift in both)
+    end_ns, early = min((max(r.t_ns for r in part.rows) + shift, part.folder) for part, shift in both)
+    if begin_ns > end_ns:
         raise RecordingError(
-            f"{late[2]} begins {(late[0] - early[1]) * 1e-9:.3f} s after the end of {early[2]}: "
-            f"no moment is seen by all"
+            f"{late} begins {(begin_ns - end_ns) * 1e-9:.3f} s after the end of {early}: no moment is seen by all"
         )
 
 
@@ -237,8 +225,7 @@ def join(options: argparse.Namespace) -> int:
     """Run `record --join`."""
 
     def progress(done: int, total: int) -> None:
-        every = 500  # frames, between two lines that report the progress
-        if done % every == 0:
+        if done % 500 == 0:
             remark(f"{done} of {total} frames")
 
     counts = join_recordings(options.join, options.output, options.by_wall_clock, progress)
@@ -248,7 +235,7 @@ def join(options: argparse.Namespace) -> int:
 
 def import_foreign(options: argparse.Namespace) -> int:
     """Run `record --from`."""
-    from slave.foreign.importing import Wish, import_pictures
+    from slave.foreign.importing import import_pictures
 
     paths: list[Path] = []
     named: dict[str, Path] = {}
@@ -260,8 +247,8 @@ def import_foreign(options: argparse.Namespace) -> int:
             raise RecordingError(f"--from {name}=: is given twice")
         else:
             named[name] = path
-    wish = Wish(options.calibration or Path("calib_json"), paths, named, options.rig, options.times)
-    import_pictures(wish, options.output, echo)
+    calibration = options.calibration or Path("calib_json")
+    import_pictures(calibration, options.output, echo, paths, named, options.rig, options.times)
     echo(f"recording in {options.output}")
     return 0
 

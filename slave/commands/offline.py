@@ -21,14 +21,14 @@ from common.arrays import Float, Int
 from common.calibration import CameraCalibration, HandProfile, load, save
 from common.command_line import UsageError, echo, remark
 from common.errors import CalibrationError, RecordingError
-from common.recording.frame_recording import MANIFEST, FrameRecording, load_manifest, open_recording
+from common.recording.frame_recording import MANIFEST, FrameRecording, FrameRow, load_manifest, open_recording
 from common.recording.pictures import FramePictures
 from common.recording.recorded_files import write_npz
 from slave.cameras.replay import is_grey
 from slave.markers.autocolour import by_clicks, by_hand, by_hues, calibrate_moving, checked, frames_for
 from slave.markers.autocolour_things import spread
 from slave.markers.colours import ColourRow, calibrate, report
-from slave.markers.reloadable import detector_for, plain_of
+from slave.markers.reloadable import detector_for
 from slave.markers.white_balance import Inline
 from slave.wrist.offline import RecordedWristDetections
 
@@ -63,26 +63,30 @@ def camera_of(recording: FrameRecording, camera: str, calibration: Path | None) 
     """The camera of a recording, with the colours of `calibration` if given."""
     recording.frames_of(camera)  # refuses an unknown name
     own = recording.manifest.cameras[camera]
-    if calibration is not None:
-        path = calibration / "cameras" / f"{camera}.json"
-        markers = load(path, CameraCalibration).markers
-        if markers is None:
-            raise CalibrationError(
-                f"{path}: markers: missing; make them: phalanx-slave colours {recording.folder} --camera {camera}"
-                f" {_clicks(recording)} -o {path}  (U,V: a pixel on each marker in the camera's first picture)"
-            )
-    else:
-        markers = own.markers
-        if markers is None:
+    if calibration is None:
+        if own.markers is None:
             raise CalibrationError(
                 f"{recording.folder}/recording.json: cameras.{camera}.markers: missing; give --calibration DIR with "
                 f"DIR/cameras/{camera}.json (make it with `phalanx-slave colours`)"
             )
+        return own
+    path = calibration / "cameras" / f"{camera}.json"
+    markers = load(path, CameraCalibration).markers
+    if markers is None:
+        clicks = " ".join(f"--click {name}=U,V" for name in recording.manifest.marker_rig().markers)
+        raise CalibrationError(
+            f"{path}: markers: missing; make them: phalanx-slave colours {recording.folder} --camera {camera}"
+            f" {clicks} -o {path}  (U,V: a pixel on each marker in the camera's first picture)"
+        )
     return msgspec.structs.replace(own, markers=markers)
 
 
-def _clicks(recording: FrameRecording) -> str:
-    return " ".join(f"--click {name}=U,V" for name in recording.manifest.marker_rig().markers)
+def _opened(folder: Path, camera: str) -> tuple[FrameRecording, tuple[FrameRow, ...]]:
+    """A recording, and the frames of one camera in it."""
+    recording = open_recording(folder)
+    if not (rows := recording.frames_of(camera)):
+        raise RecordingError(f"{folder}/frames.csv: no frame of camera {camera!r}")
+    return recording, rows
 
 
 def detect_recording(
@@ -100,16 +104,12 @@ def detect_recording(
     references. `progress` is called with frames done and in all; `tags` is given every frame, too; `windows_only` as
     `MarkerDetector`.
     """
-    recording = open_recording(folder)
-    rows = recording.frames_of(camera)
-    if not rows:
-        raise RecordingError(f"{folder}/frames.csv: no frame of camera {camera!r}")
+    recording, rows = _opened(folder, camera)
     model = camera_of(recording, camera, calibration)
     rig = recording.manifest.marker_rig()
     names, clicks = rig.markers, recording.manifest.clicks.get(camera)
     detector = detector_for(model, names, Inline(), clicks, free=rig.free_markers)
-    if (plain := plain_of(detector)) is not None:
-        plain.windows_only = windows_only
+    detector.plain.windows_only = windows_only
     shape = (len(rows), len(names))
     uv, alt_uv = np.full((*shape, 2), np.nan), np.full((*shape, 2), np.nan)
     area, quality, sigma_px = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan)
@@ -162,10 +162,7 @@ def calibrate_colours(
             their names for certain; the message states what to do.
         CalibrationError: A file cannot be read or written.
     """
-    recording = open_recording(folder)
-    rows = recording.frames_of(camera)
-    if not rows:
-        raise RecordingError(f"{folder}/frames.csv: no frame of camera {camera!r}")
+    recording, rows = _opened(folder, camera)
     rig = recording.manifest.marker_rig()
     if unknown := sorted((clicks or {}).keys() - set(rig.markers)):
         raise RecordingError(
@@ -244,8 +241,7 @@ def detect(options: argparse.Namespace) -> int:
     camera, recording, calibration = str(options.name), Path(folder), options.calibration
 
     def progress(done: int, total: int) -> None:
-        every = 500  # frames, between two lines that report the progress
-        if done % every == 0 or done == total:
+        if done % 500 == 0 or done == total:
             remark(f"{camera}: {done} of {total} frames")
 
     if is_grey(load_manifest(recording), camera):
@@ -289,7 +285,7 @@ def run(options: argparse.Namespace) -> int:
 @contextmanager
 def _recording(options: argparse.Namespace) -> Generator[Path]:
     """The recording; of a video or pictures one that lasts as long as it is needed."""
-    from slave.foreign.importing import Wish, import_pictures
+    from slave.foreign.importing import import_pictures
 
     if (options.recording / MANIFEST).is_file():
         if options.calibration is not None or options.rig is not None:
@@ -304,8 +300,7 @@ def _recording(options: argparse.Namespace) -> Generator[Path]:
             f" cameras/{options.camera}.json they are of"
         )
     with TemporaryDirectory() as folder:
-        wish = Wish(
-            named={options.camera: options.recording}, calibration=options.calibration, rig=options.rig
-        )
-        import_pictures(wish, Path(folder) / "recording", remark)
-        yield Path(folder) / "recording"
+        named = {options.camera: options.recording}
+        recording = Path(folder) / "recording"
+        import_pictures(options.calibration, recording, remark, named=named, rig_name=options.rig)
+        yield recording

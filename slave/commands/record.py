@@ -9,18 +9,18 @@ import sys
 import threading
 from collections.abc import Generator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import cv2
 
 from common.calibration import CameraCalibration, RigCalibration, load
-from common.clock import Clock, SkewedClock, SystemClock
+from common.clock import Clock, SystemClock
 from common.command_line import UsageError, echo, remark
 from common.errors import CalibrationError, CameraError, PhalanxError
-from slave.commands import devices
+from slave.commands.devices import Drivers, orientation_of
 from slave.commands.join import import_foreign, join
-from slave.commands.options import camera_of, camera_path, clock_of, objects_of, open_lit, skew_of, world_of
+from slave.commands.options import camera_of, camera_path, clock_of, objects_of, skew_of, world_of
 from slave.commands.run import import_table_of_imu
 from slave.service import stop_by_signal
 
@@ -28,14 +28,6 @@ if TYPE_CHECKING:
     from common.recording.frame_recording import Manifest
     from slave.imu.recording import ImuRecorder
     from slave.recorder import Progress
-
-
-@dataclass(frozen=True, slots=True)
-class _Scene:
-    rig: RigCalibration
-    camera: CameraCalibration
-    clock: SkewedClock
-    true_clock: Clock
 
 
 def run(options: argparse.Namespace) -> int:
@@ -59,18 +51,19 @@ def record_camera(options: argparse.Namespace) -> int:
     from common.recording.frame_writing import refuse_occupied
     from slave.commands.simulated import add_imu, imu_of
 
-    scene = _scene(options)
-    manifest = _manifest(options, scene)
+    rig, camera = camera_of(options)
+    drivers = _drivers(options, rig)
+    manifest = _manifest(drivers)
     refuse_occupied(options.output)  # before a camera is opened
     imu = None
     if options.imu == "synthetic":
-        imu = imu_of(str(options.camera), *world_of(options, scene.rig), options.scene, options.seed)
-    with _imu_recorder(options, scene) as imu_recorder:
-        done, failure = _record(options, scene, manifest, imu_recorder)
+        imu = imu_of(str(options.camera), *world_of(options, rig))
+    with _imu_recorder(drivers) as imu_recorder:
+        done, failure = _record(drivers, camera, manifest, imu_recorder)
         if imu_recorder is not None and done.frames:
             imu_recorder.keep()
     if imu is not None and done.frames:
-        add_imu(options.output, imu, options.scene_epoch_ns, scene.clock)
+        add_imu(options.output, imu, options.scene_epoch_ns, drivers.clock)
     os.sync()  # what was reported as recorded is on the disk, also when the power goes now
     if failure is None and imu_recorder is not None:
         failure = imu_recorder.failure
@@ -82,10 +75,9 @@ def record_camera(options: argparse.Namespace) -> int:
     return 0
 
 
-def _scene(options: argparse.Namespace) -> _Scene:
+def _drivers(options: argparse.Namespace, rig: RigCalibration) -> Drivers:
     from slave.commands.simulated import FrameClock
 
-    rig, camera = camera_of(options)
     true_clock: Clock = SystemClock()
     if options.scene_epoch_ns is None:
         options.scene_epoch_ns = true_clock.now_ns()
@@ -93,14 +85,15 @@ def _scene(options: argparse.Namespace) -> _Scene:
         if options.camera != "synthetic":
             raise CameraError(f"--every-frame: only a synthetic camera can wait, not {options.camera}")
         true_clock = FrameClock(options.scene_epoch_ns)
-    return _Scene(rig, camera, clock_of(options, true_clock), true_clock)
+    return Drivers(options, rig, clock_of(options, true_clock), true_clock)
 
 
-def _manifest(options: argparse.Namespace, scene: _Scene) -> "Manifest":
+def _manifest(drivers: Drivers) -> "Manifest":
     from common.recording.frame_recording import Manifest
     from slave.recorder import clock_of as recorded_clock
 
-    rig, skewed = scene.rig, skew_of(options, scene.true_clock)
+    options, rig = drivers.options, drivers.rig
+    skewed = skew_of(options, drivers.true_clock)
     if options.every_frame:
         skewed = f" as frames are drawn{skewed}"
     return Manifest(
@@ -109,19 +102,20 @@ def _manifest(options: argparse.Namespace, scene: _Scene) -> "Manifest":
         cameras={name: load(camera_path(options, name), CameraCalibration) for name in rig.cameras},
         rig=rig,
         note=options.note,
-        clock=recorded_clock(scene.clock, skewed),
+        clock=recorded_clock(drivers.clock, skewed),
         objects=objects_of(options, rig),
     )
 
 
 def _record(
-    options: argparse.Namespace, scene: _Scene, manifest: "Manifest", imu_recorder: "ImuRecorder | None"
+    drivers: Drivers, camera: CameraCalibration, manifest: "Manifest", imu_recorder: "ImuRecorder | None"
 ) -> "tuple[Progress, PhalanxError | None]":
     """Record to the end; how much, and the error that ended it early, if any."""
     from slave.recorder import Length, ProgressDisplay, Recorder, feed
 
+    options = drivers.options
     display = ProgressDisplay(options.name, sys.stderr)
-    source = open_lit(options, scene.rig, scene.camera, scene.clock, scene.true_clock)
+    source = drivers.camera(camera)
     try:
         recorder = Recorder(
             options.output,
@@ -147,19 +141,17 @@ def _record(
 
 
 @contextmanager
-def _imu_recorder(options: argparse.Namespace, scene: _Scene) -> "Generator[ImuRecorder | None, None, None]":
-    if options.imu is None or options.imu == "synthetic":
+def _imu_recorder(drivers: Drivers) -> "Generator[ImuRecorder | None, None, None]":
+    if drivers.options.imu in (None, "synthetic"):
         yield None
         return
     from slave.imu.recording import ImuRecorder
 
-    imu = scene.rig.imu
+    imu = drivers.rig.imu
     if imu is None:
-        raise CalibrationError(f"rig {scene.rig.name!r}: imu: missing; there is none to record")
-    orientation, stop = devices.orientation_of(imu), threading.Event()
-    imu_recorder = ImuRecorder(
-        devices.open_imu(imu.name, options.imu, imu.rate_hz, scene.clock, stop), orientation, stop
-    )
+        raise CalibrationError(f"rig {drivers.rig.name!r}: imu: missing; there is none to record")
+    orientation, stop = orientation_of(imu), threading.Event()
+    imu_recorder = ImuRecorder(replace(drivers, stop=stop).imu(imu), orientation, stop)
     try:
         yield imu_recorder
     finally:

@@ -13,67 +13,51 @@ from typing import TYPE_CHECKING
 
 import cv2
 
-from common.calibration import HandProfile, RigCalibration, load
-from common.calibration.object_profile import ObjectProfile
-from common.clock import Clock, SkewedClock, SystemClock
+from common.calibration import HandProfile, load
+from common.clock import Clock, SystemClock
 from common.command_line import UsageError, echo
 from common.errors import CalibrationError, PhalanxError, RecordingError
 from common.imu.csv_table import ACCEL, GYRO, MAG, TIME
 from slave.commands import devices
+from slave.commands.devices import Drivers
 from slave.commands.options import (
     camera_of,
     camera_path,
-    clock_of,
-    epoch_of,
     objects_of,
-    open_lit,
     rig_of,
     rig_path,
     secrets_of,
     skew_of,
     tree_of,
-    world_of,
 )
-from slave.service import COMPILE_S, ConnectionLost, Service, stop_by_signal, stop_on_signals
-from slave.sources import TrackerSource
+from slave.service import COMPILE_S, Service, stop_by_signal
 
 if TYPE_CHECKING:
     from common.bus.keys import Access
     from common.link.datagram import LinkKey
     from slave.raw import RawSettings
     from slave.sender import Sender
-    from slave.sources import ImuSource
     from slave.tuning import CameraFiles
 
-USUAL_NAME = "imu"
+DEFAULT_NAME = "imu"
 
 
 def send_imu(options: argparse.Namespace) -> int:
     """Send samples until stopped."""
-    from slave.commands.simulated import SyntheticSensor, imu_of
     from slave.sender import send_samples
 
     rig = rig_of(options)
     if options.name is None:
-        options.name = USUAL_NAME if rig.imu is None else rig.imu.name
+        options.name = DEFAULT_NAME if rig.imu is None else rig.imu.name
     if rig.imu is None or options.name != rig.imu.name:
         has = "it has none" if rig.imu is None else f"its IMU is {rig.imu.name!r}"
         raise CalibrationError(f"rig {rig.name!r} has no IMU {options.name!r}; {has}")
     orientation = devices.orientation_of(rig.imu)
-    true_clock = SystemClock()
-    clock = clock_of(options, true_clock)
-    key, access = secrets_of(options)
-    service = Service(os.environ, noun="samples")
+    secrets, service = secrets_of(options), Service(os.environ, noun="samples")
     with stop_by_signal() as stop:
-        if options.imu == "synthetic":
-            epoch_ns = epoch_of(options, true_clock)
-            imu = imu_of(options.imu, *world_of(options, rig), options.scene, options.seed)
-            source: ImuSource = SyntheticSensor(imu.sample, imu.rate_hz, epoch_ns, clock, stop)
-        else:
-            source = devices.open_imu(
-                options.name, options.imu, rig.imu.rate_hz, clock, stop, service.connection_lost
-            )
-        send_samples(_sender(options, key, clock, stop, service, access), source, orientation)
+        drivers = Drivers.running(options, rig, stop, service.connection_lost)
+        source = drivers.imu(rig.imu)
+        send_samples(_sender(options, secrets, drivers.clock, stop, service), source, orientation)
     return 0
 
 
@@ -84,7 +68,7 @@ def import_table_of_imu(options: argparse.Namespace) -> int:
 
     units = {what: unit for what in (TIME, GYRO, ACCEL, MAG) if (unit := getattr(options, f"{what}_unit"))}
     table = read_csv(options.imu_csv, units, options.rate_hz)
-    import_table(table, options.name or USUAL_NAME, options.output, echo)
+    import_table(table, options.name or DEFAULT_NAME, options.output, echo)
     return 0
 
 
@@ -94,38 +78,17 @@ def send_tracker(options: argparse.Namespace) -> int:
 
     rig = rig_of(options)
     profile = devices.object_with(tree_of(options), rig, options.name)
-    true_clock = SystemClock()
-    clock = clock_of(options, true_clock)
-    key, access = secrets_of(options)
-    service = Service(os.environ, noun="poses")
+    secrets, service = secrets_of(options), Service(os.environ, noun="poses")
     with stop_by_signal() as stop:
-        source = _open(options, rig, profile, clock, true_clock, stop, service.connection_lost)
+        drivers = Drivers.running(options, rig, stop, service.connection_lost)
+        source = drivers.tracker(profile)
         try:
-            sender = _sender(options, key, clock, stop, service, access)
+            sender = _sender(options, secrets, drivers.clock, stop, service)
         except PhalanxError:
             source.close()
             raise
         send_poses(sender, source, recorded=options.tracker.startswith("survive:"))
     return 0
-
-
-def _open(
-    options: argparse.Namespace,
-    rig: RigCalibration,
-    profile: ObjectProfile,
-    clock: SkewedClock,
-    true_clock: SystemClock,
-    stop: threading.Event,
-    connection_lost: ConnectionLost,
-) -> TrackerSource:
-    if options.tracker != "synthetic":
-        named = options.tracker, options.serial, options.program
-        return devices.open_tracker(options.name, *named, clock, stop, connection_lost)
-    from slave.commands.simulated import TRACKER_HZ, SyntheticSensor, poses_of, tracker_of
-
-    epoch_ns = epoch_of(options, true_clock)
-    tracker = tracker_of(*world_of(options, rig), options.scene, options.seed, profile)
-    return SyntheticSensor(poses_of(options.name, tracker), TRACKER_HZ, epoch_ns, clock, stop)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -154,37 +117,34 @@ def send_camera(options: argparse.Namespace) -> int:
     from slave.markers import engine as marker_engine
     from slave.wrist import engine as wrist_engine
 
-    stop, service = stop_on_signals(), Service(os.environ)
+    service = Service(os.environ)
     if options.engine == "numba":
         service.starting(COMPILE_S)
-    files = _files(options)
-    true_clock = SystemClock()
-    clock = clock_of(options, true_clock)
-    key, access = secrets_of(options)
-    raw = _raw_settings(options, true_clock)
-    engine = (wrist_engine if files.rig.kind == "wrist" else marker_engine).engine_named(options.engine)
-    source = open_lit(options, files.rig, files.camera, clock, true_clock, stop, service.connection_lost)
-    sender = _sender(options, key, clock, stop, service, access)
-    send_detections(sender, files, source, options.colours, options.scan, engine, raw)
+    with stop_by_signal() as stop:
+        files, secrets = _files(options), secrets_of(options)
+        raw = _raw_settings(options)
+        engine = (wrist_engine if files.rig.kind == "wrist" else marker_engine).engine_named(options.engine)
+        drivers = Drivers.running(options, files.rig, stop, service.connection_lost)
+        source = drivers.camera(files.camera)
+        sender = _sender(options, secrets, drivers.clock, stop, service)
+        send_detections(sender, files, source, options.colours, options.scan, engine, raw)
     return 0
 
 
 def _sender(
     options: argparse.Namespace,
-    key: "LinkKey",
+    secrets: "tuple[LinkKey, Access]",
     clock: Clock,
     stop: threading.Event,
     service: Service,
-    access: "Access",
 ) -> "Sender":
     # Imported here: to detect in a recording needs neither sockets nor zenoh, and starts twice as fast.
     from slave.sender import Sender
     from slave.uplink import Uplink
 
-    uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
-    return Sender(
-        options.name, uplink, clock, stop, lambda line: echo(f"{options.name}: {line}"), service, access
-    )
+    (key, access), name = secrets, options.name
+    uplink = Uplink(name, key, clock, options.beacon_port, options.bind)
+    return Sender(name, uplink, clock, stop, lambda line: echo(f"{name}: {line}"), service, access)
 
 
 def _files(options: argparse.Namespace) -> "CameraFiles":
@@ -201,7 +161,7 @@ def _files(options: argparse.Namespace) -> "CameraFiles":
     return replace(files, hand_path=hand_path, hand=load(hand_path, HandProfile))
 
 
-def _raw_settings(options: argparse.Namespace, true_clock: Clock) -> "RawSettings | None":
+def _raw_settings(options: argparse.Namespace) -> "RawSettings | None":
     """Where raw frames go, if they are kept; the folder is there from here on."""
     from slave.raw import RawSettings
 
@@ -212,4 +172,4 @@ def _raw_settings(options: argparse.Namespace, true_clock: Clock) -> "RawSetting
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RecordingError(f"--raw-folder {folder}: cannot make it: {error.strerror}") from error
-    return RawSettings(folder, round(options.raw_reserve_mb * 1e6), skew_of(options, true_clock))
+    return RawSettings(folder, round(options.raw_reserve_mb * 1e6), skew_of(options, SystemClock()))

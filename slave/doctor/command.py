@@ -4,12 +4,13 @@ import argparse
 import shlex
 import threading
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.calibration.strobe import Limit, StrobeCalibration, limits_of
 from common.clock import SystemClock
-from common.command_line import UsageError, echo
+from common.command_line import WRONG_USAGE, UsageError, echo
 from common.errors import LightsError
 from common.machine import program
 from common.recording.frame_recording import Illumination
@@ -123,13 +124,9 @@ def _table(limits: list[Limit]) -> list[str]:
     return lines
 
 
-USUAL_RIG = "wrist"
-
-
 def look_at_lights(options: argparse.Namespace) -> int:
     """Print the budget; switch lights only where that is asked for."""
-
-    rig = rig_of(options, USUAL_RIG)
+    rig = rig_of(options, "wrist")
     camera = load(camera_path(options, rig.cameras[0]), CameraCalibration)
     if not (options.blink or options.off):
         echo(budget(rig, camera))
@@ -181,7 +178,9 @@ def examine(options: argparse.Namespace, system: System) -> Iterator[Finding]:
         yield unseen("slave", f"none in {ETC}: give --name, --rig, --camera, or install it first")
         yield from check_keys(system, folder, None)
     for name, slave in zip(names, slaves, strict=True):
-        yield from _of(f"{name}: " if len(names) > 1 else "", _look(system, folder, name, slave))
+        prefix = f"{name}: " if len(names) > 1 else ""
+        for one in _look(system, folder, name, slave):
+            yield replace(one, check=prefix + one.check)
     port = next((one.beacon_port for one in given), options.beacon_port)
     yield from check_master(system, folder, options.master, port)
 
@@ -189,15 +188,15 @@ def examine(options: argparse.Namespace, system: System) -> Iterator[Finding]:
 def _look(
     system: System, folder: Path, name: str, slave: "argparse.Namespace | Finding"
 ) -> Iterator[Finding]:
-    unit = check_unit(system, name)
-    yield unit.finding
+    service, runs = check_unit(system, name)
+    yield service
     yield from check_keys(system, folder, name)
     if isinstance(slave, Finding):
         yield slave
         return
     yield from check_devices(system, slave)
     if slave.camera is not None:
-        yield from check_camera(slave, unit.runs)
+        yield from check_camera(slave, runs)
     else:
         sensor = "IMU" if slave.imu is not None else "tracker"
         yield unseen("device", f"{sensor}: the service reports whether it answers")
@@ -230,27 +229,23 @@ def _parsed(words: Sequence[str], name: str) -> "argparse.Namespace | Finding":
     try:
         return PROGRAM.parse(["run", *words])[1]
     except SystemExit as error:
-        parser_exit = 2
-        if error.code == parser_exit:
-            return fail(
-                "options", f"of {name}: see the line above", f"{ETC}/{name}.env: phalanx-slave run --help"
-            )
-        raise
+        if error.code != WRONG_USAGE:
+            raise
+        fix = f"{ETC}/{name}.env: phalanx-slave run --help"
+        return fail("options", f"of {name}: see the line above", fix)
 
 
 def _extras(slave: argparse.Namespace) -> Iterator[str]:
-    if str(getattr(slave, "camera", "")).partition(":")[0] == "picamera2":
+    camera, imu, lights = (
+        str(value or "").partition(":")[0] for value in (slave.camera, slave.imu, slave.lights)
+    )
+    if camera == "picamera2":
         yield "picamera2"
-    if str(getattr(slave, "lights", "")).startswith("gpio:"):
+    if lights == "gpio":
         yield "gpiod"
-    if "i2c:" in str(getattr(slave, "lights", "")) or "lsm6dsox" in str(getattr(slave, "imu", "")):
+    if lights == "i2c" or imu == "lsm6dsox":
         yield "smbus2"
-    if "ximu3" in str(getattr(slave, "imu", "")):
+    if imu == "ximu3":
         yield "serial"
-    if getattr(slave, "engine", "") == "numba":
+    if slave.engine == "numba":
         yield "numba"
-
-
-def _of(prefix: str, findings: Iterator[Finding]) -> Iterator[Finding]:
-    for one in findings:
-        yield Finding(prefix + one.check, one.verdict, one.text, one.fix)

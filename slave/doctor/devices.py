@@ -6,6 +6,7 @@ reported that it was not checked.
 """
 
 import argparse
+import contextlib
 import stat
 import threading
 from collections.abc import Iterator, Mapping
@@ -43,26 +44,23 @@ def check_devices(system: System, slave: argparse.Namespace) -> Iterator[Finding
     """The devices that a slave with these options opens."""
     for check, place, fix in _places(slave):
         yield _open_to_service(system, check, place, fix)
-    if str(getattr(slave, "camera", "")).partition(":")[0] == "picamera2":
+    if str(slave.camera).partition(":")[0] == "picamera2":
         yield _dma_heap(system)
 
 
 def _places(slave: argparse.Namespace) -> Iterator[tuple[str, str, str]]:
     """Name, path and advice of each device."""
-    kind, _, place = str(getattr(slave, "camera", None) or "").partition(":")
+    kind, _, place = str(slave.camera or "").partition(":")
     if kind == "v4l2":
-        path = f"/dev/video{place or '0'}" if place.isdecimal() or not place else place
-        yield "camera device", path, "plug the camera in; `v4l2-ctl --list-devices` shows where it is"
-    kind, _, place = str(getattr(slave, "imu", None) or "").partition(":")
+        fix = "plug the camera in; `v4l2-ctl --list-devices` shows where it is"
+        yield "camera device", str(device_path(place)), fix
+    kind, _, place = str(slave.imu or "").partition(":")
     if kind == "ximu3":
-        yield (
-            "IMU device",
-            place.partition("@")[0],
-            "plug it in; `phalanx-slave doctor --ports` shows the ports",
-        )
+        fix = "plug it in; `phalanx-slave doctor --ports` shows the ports"
+        yield "IMU device", place.partition("@")[0], fix
     elif kind == "lsm6dsox":
         yield "IMU bus", f"/dev/i2c-{place.partition(':')[0]}", I2C_ON
-    kind, _, place = str(getattr(slave, "lights", None) or "").partition(":")
+    kind, _, place = str(slave.lights or "").partition(":")
     if kind == "gpio":
         chip = place.partition(":")[0]
         path = chip if "/" in chip else f"/dev/gpiochip{chip}" if chip.isdecimal() else f"/dev/{chip}"
@@ -78,12 +76,8 @@ def _open_to_service(system: System, check: str, place: str, fix: str) -> Findin
     except OSError as error:
         return fail(check, f"{place}: {error.strerror}", fix)
     if not _may_open(status.st_mode, status.st_gid, _group_ids(system)):
-        mode = stat.filemode(status.st_mode)
-        return fail(
-            check,
-            f"{place}: {mode}, not of a group of the service",
-            f"a udev rule that gives it to one of {', '.join(GROUPS)}",
-        )
+        text = f"{place}: {stat.filemode(status.st_mode)}, not of a group of the service"
+        return fail(check, text, f"a udev rule that gives it to one of {', '.join(GROUPS)}")
     return ok(check, f"{place}, open to the service")
 
 
@@ -102,9 +96,7 @@ def _dma_heap(system: System) -> Finding:
 
 def _may_open(mode: int, group: int, ids: Mapping[str, int]) -> bool:
     """Whether a user who is only in the groups of the service may read and write."""
-    everybody = stat.S_IROTH | stat.S_IWOTH
-    groups = stat.S_IRGRP | stat.S_IWGRP
-    return mode & everybody == everybody or (group in ids.values() and mode & groups == groups)
+    return mode & 0o006 == 0o006 or (group in ids.values() and mode & 0o060 == 0o060)
 
 
 def _group_ids(system: System) -> dict[str, int]:
@@ -165,11 +157,8 @@ def _opened(slave: argparse.Namespace, file: CameraCalibration, *, wrist: bool) 
         try:
             camera = devices.open_camera(str(slave.camera), slave, file, SystemClock(), None, wrist=wrist)
             assert camera is not None  # its driver is a real one
-            try:
-                frames = 10
-                seen = sum(camera.read() is not None for _ in range(frames))
-            finally:
-                camera.close()
+            with contextlib.closing(camera):
+                seen = sum(camera.read() is not None for _ in range(10))
         except PhalanxError as error:
             found.append(fail("camera", str(error), "as the error states; docs/cameras.md has the rest"))
         else:
@@ -200,7 +189,6 @@ def _automatics(path: Path) -> Finding:
     finally:
         device.close()
     if on:
-        return fail(
-            "camera", f"automatics are on: {', '.join(on)}", "restart the service; stop other programs"
-        )
+        fix = "restart the service; stop other programs"
+        return fail("camera", f"automatics are on: {', '.join(on)}", fix)
     return ok("camera", f"the service has it; {len(there)} automatics, all off")

@@ -20,6 +20,7 @@ from pathlib import Path
 import msgspec
 
 from common.machine import ROOT, Machine, Program
+from slave.install.probe import NEWEST, OLDEST
 from slave.install.systemd import finished
 
 
@@ -151,8 +152,7 @@ def pairs(text: str, between: str = "=") -> dict[str, str]:
     return {name: value for name, _, value in (line.partition(between) for line in text.splitlines())}
 
 
-RELEASES = {"trixie": "13", "bookworm": "12"}  # of Debian, and of the Raspberry Pi OS made from it
-PYTHONS = ((3, 11), (3, 13))
+RELEASES = ("bookworm", "trixie")  # of Debian, and of the Raspberry Pi OS made from it
 STATE = "/var/lib/phalanx"
 # Raspberry Pi documentation, "vcgencmd get_throttled": bit -> its meaning; the same 16 bits higher: since the start.
 BITS = {
@@ -167,59 +167,42 @@ SUPPLY = "a stronger power supply, a shorter or thicker cable"
 
 def check_host(system: System) -> Iterator[Finding]:
     """Everything that is neither a device nor a program of ours."""
-    yield _bits()
-    yield _release(system)
-    yield _board(system)
-    yield _python()
-    yield from _metrics(system)
-    yield _memory_limit(system)
-    yield _throttled(system)
-
-
-def _bits() -> Finding:
     machine, bits = platform.machine(), struct.calcsize("P") * 8
-    if bits != 64:
-        return fail(
-            "64 bit", f"{machine}, this Python has {bits} bit", "install the 64-bit Raspberry Pi OS (Lite)"
-        )
-    return ok("64 bit", machine)
-
-
-def _release(system: System) -> Finding:
+    if bits == 64:
+        yield ok("64 bit", machine)
+    else:
+        os_64 = "install the 64-bit Raspberry Pi OS (Lite)"
+        yield fail("64 bit", f"{machine}, this Python has {bits} bit", os_64)
     text = system.text("/etc/os-release") or ""
     stated = dict(re.findall(r'^(\w+)="?([^"\n]*)"?$', text, re.MULTILINE))
     name = stated.get("PRETTY_NAME", "unknown")
     if stated.get("VERSION_CODENAME") in RELEASES:
-        return ok("system", name)
-    return warn(
-        "system", f"{name}: not tried with it", f"Raspberry Pi OS or Debian {' or '.join(sorted(RELEASES))}"
-    )
-
-
-def _board(system: System) -> Finding:
+        yield ok("system", name)
+    else:
+        tried = f"Raspberry Pi OS or Debian {' or '.join(RELEASES)}"
+        yield warn("system", f"{name}: not tried with it", tried)
     model = system.text("/sys/firmware/devicetree/base/model")
-    return unseen("board", "no device tree: not a Raspberry Pi") if model is None else ok("board", model)
-
-
-def _python() -> Finding:
+    yield unseen("board", "no device tree: not a Raspberry Pi") if model is None else ok("board", model)
     version = platform.python_version()
-    if not PYTHONS[0] <= sys.version_info[:2] <= PYTHONS[1]:
-        return fail("Python", version, "Python 3.11 to 3.13")
-    return ok("Python", f"{version} in {sys.prefix}")
+    if OLDEST <= sys.version_info[:2] <= NEWEST:
+        yield ok("Python", f"{version} in {sys.prefix}")
+    else:
+        yield fail("Python", version, "Python 3.11 to 3.13")
+    yield from _metrics(system)
+    yield _memory_limit(system)
+    yield _throttled(system)
 
 
 def _metrics(system: System) -> Iterator[Finding]:
     folder = system.path(STATE) if system.path(STATE).is_dir() else system.root
     metrics = Machine(folder, system.environment).metrics()
     free_mb = metrics.get("disk_free_mb")
-    few_mb, no_mb = 500.0, 100.0
     if free_mb is None:
         yield unseen("disk", f"{folder}: not known")
-    elif free_mb < few_mb:
-        level = fail if free_mb < no_mb else warn
-        yield level(
-            "disk", f"{free_mb:.0f} MB free", "delete recordings or old releases in /opt/phalanx/releases"
-        )
+    elif free_mb < 500.0:
+        level = fail if free_mb < 100.0 else warn
+        delete = "delete recordings or old releases in /opt/phalanx/releases"
+        yield level("disk", f"{free_mb:.0f} MB free", delete)
     else:
         yield ok("disk", f"{free_mb / 1000.0:.1f} GB free")
     now, limit = metrics.get("temperature_c"), metrics.get("temperature_limit_c")
@@ -250,13 +233,11 @@ def _throttled(system: System) -> Finding:
     if flags is None:
         return unseen("throttling", "no Raspberry Pi firmware that reports it, no vcgencmd")
     now = [text for bit, text in BITS.items() if flags >> bit & 1]
-    since = 16
-    before = [text for bit, text in BITS.items() if flags >> (bit + since) & 1 and text not in now]
+    before = [text for bit, text in BITS.items() if flags >> (bit + 16) & 1 and text not in now]
     if not now and not before:
         return ok("throttling", "none since the start")
     stated = [*(f"{text} now" for text in now), *(f"{text} since the start" for text in before)]
-    fix = SUPPLY if flags & (1 | 1 << since) else COOL
-    return warn("throttling", ", ".join(stated), fix)
+    return warn("throttling", ", ".join(stated), SUPPLY if flags & (1 | 1 << 16) else COOL)
 
 
 def _flags(system: System) -> int | None:
@@ -292,27 +273,24 @@ def check_clock(system: System, master: str | None) -> Iterator[Finding]:
     except ValueError:
         yield warn("clock", f"chronyd reports {asked.out.strip()!r}", "sudo systemctl restart chrony")
         return
-    yield _tracking(fields, offset_s, rms_s, master)
+    yield _tracking(fields[1] or "nobody", fields[2], fields[13], offset_s, rms_s, master)
 
 
-def _tracking(fields: list[str], offset_s: float, rms_s: float, master: str | None) -> Finding:
-    reference, stratum, leap = 1, 2, 13
-    who = fields[reference] or "nobody"
-    if fields[leap] == "Not synchronised":
+def _tracking(
+    who: str, stratum: str, leap: str, offset_s: float, rms_s: float, master: str | None
+) -> Finding:
+    if leap == "Not synchronised":
         fix = "is the master's machine on, with `local stratum 8` and `allow` in its chrony.conf? `chronyc sources`"
         return warn("clock", "chrony has found no time yet", fix)
-    stated = (
-        f"{offset_s * 1e6:+.0f} µs off {who} (stratum {fields[stratum]}), {rms_s * 1e6:.0f} µs in the mean"
-    )
-    far_s = 1e-3  # libcamera brings cameras in step by the system's clock: its error adds to theirs
-    if abs(offset_s) > far_s:
-        return warn(
-            "clock", stated, "wait some minutes; then `chronyc sources -v`, or `sudo chronyc makestep`"
-        )
+    stated = f"{offset_s * 1e6:+.0f} µs off {who} (stratum {stratum}), {rms_s * 1e6:.0f} µs in the mean"
+    if (
+        abs(offset_s) > 1e-3
+    ):  # libcamera brings cameras in step by the system's clock: its error adds to theirs
+        fix = "wait some minutes; then `chronyc sources -v`, or `sudo chronyc makestep`"
+        return warn("clock", stated, fix)
     if master is not None and who != master:
-        return warn(
-            "clock", f"{stated}; not by {master}", "see /etc/chrony/conf.d/phalanx.conf, `chronyc sources`"
-        )
+        fix = "see /etc/chrony/conf.d/phalanx.conf, `chronyc sources`"
+        return warn("clock", f"{stated}; not by {master}", fix)
     return ok("clock", stated)
 
 
@@ -335,38 +313,30 @@ BEFORE = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Unit:
-    """State of a service; `runs`: it has its device."""
-
-    finding: Finding
-    runs: bool
-
-
-def check_unit(system: System, name: str) -> Unit:
-    """The service of the slave `name`."""
+def check_unit(system: System, name: str) -> tuple[Finding, bool]:
+    """The service of the slave `name`, and whether it runs and so has its device."""
     unit, check = f"phalanx-slave@{name}.service", "service"
     asked = system.run(("systemctl", "show", unit, *(f"--property={one}" for one in ASKED)), 10.0)
     if asked.code != 0:
-        return Unit(unseen(check, f"{unit}: systemd does not answer here"), False)
+        return unseen(check, f"{unit}: systemd does not answer here"), False
     stated = pairs(asked.out)
     if stated.get("LoadState") != "loaded":
         install = "phalanx-slave install --master HOST, or phalanx fleet deploy from the PC"
-        return Unit(warn(check, f"{unit}: not installed", install), False)
+        return warn(check, f"{unit}: not installed", install), False
     state, status = stated.get("ActiveState", ""), stated.get("ExecMainStatus", "")
     restarts, words = stated.get("NRestarts", "0"), stated.get("StatusText", "")
     log = f"journalctl -u {unit} -n 50"
     if state == "active":
         if restarts != "0":
-            return Unit(warn(check, f"{words}; restarted {restarts} times since it was started", log), True)
+            return warn(check, f"{words}; restarted {restarts} times since it was started", log), True
         if stated.get("UnitFileState") != "enabled":
-            return Unit(warn(check, f"{words}; not started at boot", f"sudo systemctl enable {unit}"), True)
-        return Unit(ok(check, words or "active"), True)
+            return warn(check, f"{words}; not started at boot", f"sudo systemctl enable {unit}"), True
+        return ok(check, words or "active"), True
     if state == "inactive":
-        return Unit(fail(check, f"{unit}: stopped", f"sudo systemctl start {unit}"), False)
+        return fail(check, f"{unit}: stopped", f"sudo systemctl start {unit}"), False
     why, fix = BEFORE.get(status, (words or f"it ended with {status}", log))
     runs = state == "activating" and stated.get("SubState") == "start"
-    return Unit(fail(check, f"{state}, {restarts} restarts: {why}", fix), runs)
+    return fail(check, f"{state}, {restarts} restarts: {why}", fix), runs
 
 
 CURRENT = "/opt/phalanx/current"

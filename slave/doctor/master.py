@@ -4,6 +4,7 @@ A beacon of this rig has to arrive within a second; nothing is sent. All keys ex
 name, are valid, and nobody else can read them.
 """
 
+import contextlib
 import os
 import socket
 import time
@@ -38,16 +39,14 @@ def check_master(
             addresses = {str(one[4][0]) for one in socket.getaddrinfo(master, None, socket.AF_INET)}
             yield ok("master's name", f"{master} is {', '.join(sorted(addresses))}")
         except OSError as error:
-            yield fail(
-                "master's name", f"{master}: {error.strerror}", "give its address, or NAME.local (mDNS)"
-            )
+            fix = "give its address, or NAME.local (mDNS)"
+            yield fail("master's name", f"{master}: {error.strerror}", fix)
     try:
         file = keys / RIG_KEY
         key = rig_key(system.environment, file if file.exists() else None)
     except (PhalanxError, OSError) as error:
-        yield unseen(
-            "beacon", f"without a rig key no beacon can be distinguished from a foreign one: {error}"
-        )
+        why = f"without a rig key no beacon can be distinguished from a foreign one: {error}"
+        yield unseen("beacon", why)
         return
     yield _listen(SlaveLink("doctor", key, SystemClock(), os.urandom), port, bind, addresses)
 
@@ -59,7 +58,7 @@ def _listen(link: SlaveLink, port: int, bind: str, addresses: set[str]) -> Findi
         return fail("beacon", str(error), "stop what has the port, or use --beacon-port on both sides")
     listen_s = 1.0  # the beacon comes four times a second and more
     end_s = time.monotonic() + listen_s
-    try:
+    with contextlib.closing(beacons):
         while time.monotonic() < end_s:
             if (arrived := beacons.receive()) is None:
                 continue
@@ -67,24 +66,18 @@ def _listen(link: SlaveLink, port: int, bind: str, addresses: set[str]) -> Findi
             before = link.refused.total()
             link.receive_beacon(datagram, address, time.monotonic_ns())
             if link.refused.total() == before:
-                return _received(address[0], addresses)
-    finally:
-        beacons.close()
+                if addresses and address[0] not in addresses:
+                    text = f"from {address[0]}, which is not the master named"
+                    return warn("beacon", text, "is a second master running?")
+                return ok("beacon", f"from {address[0]}, of this rig")
     refused = {str(reason.value): count for reason, count in link.refused.items()}
     if "version" in refused:
-        return fail(
-            "beacon", "a master of another version of the wire", "install the same version on both sides"
-        )
+        fix = "install the same version on both sides"
+        return fail("beacon", "a master of another version of the wire", fix)
     if refused:
         stated = ", ".join(f"{reason} {count}" for reason, count in refused.items())
         return fail("beacon", f"received, but not of this rig: {stated}", "compare rig.key of both sides")
     return fail("beacon", f"none in {listen_s:g} s on UDP port {port}", NOT_RECEIVED.format(port))
-
-
-def _received(address: str, expected: set[str]) -> Finding:
-    if expected and address not in expected:
-        return warn("beacon", f"from {address}, which is not the master named", "is a second master running?")
-    return ok("beacon", f"from {address}, of this rig")
 
 
 FOLDER = "/etc/phalanx/keys"
@@ -148,20 +141,13 @@ def _certificate(system: System, folder: Path, name: str, now: datetime) -> Find
     try:
         own.verify_directly_issued_by(authority)
     except (InvalidSignature, ValueError, TypeError):
-        return fail(
-            "certificate", f"{identity.certificate}: not signed by {identity.authority}", MAKE.format(name)
-        )
-    for whose, one in {
-        f"the certificate of {name!r}": validity,
-        "the certificate of this rig": of_rig,
-    }.items():
-        if fault := one.invalid_at(now, whose):
-            return fail("certificate", fault, CLOCK_FIX)
+        text = f"{identity.certificate}: not signed by {identity.authority}"
+        return fail("certificate", text, MAKE.format(name))
+    of_device = validity.invalid_at(now, f"the certificate of {name!r}")
+    if fault := of_device or of_rig.invalid_at(now, "the certificate of this rig"):
+        return fail("certificate", fault, CLOCK_FIX)
     until = validity.until
     if until - now < SOON:
-        return warn(
-            "certificate",
-            f"ends in {(until - now).days} days",
-            "phalanx fleet keys DIR --renew, then phalanx fleet deploy",
-        )
+        fix = "phalanx fleet keys DIR --renew, then phalanx fleet deploy"
+        return warn("certificate", f"ends in {(until - now).days} days", fix)
     return ok("certificate", f"of {name}, signed by the rig's authority, until {until:%Y-%m-%d}")

@@ -7,7 +7,7 @@ which takes no room; where the disks differ it is copied. It is read once, to co
 import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -36,18 +36,6 @@ from slave.foreign.sources import (
 NOTE = "imported from "
 
 
-@dataclass(frozen=True, slots=True)
-class Wish:
-    """What is to be imported."""
-
-    calibration: Path  # calib_json tree
-    paths: Sequence[Path] = ()  # videos, folders of pictures, or folders of these
-    # camera -> its video or folder of pictures
-    named: Mapping[str, Path] = field(default_factory=dict[str, Path])
-    rig: str | None = None  # name of the rig; None: the one that has these cameras
-    times: Path | None = None  # table of the times of all cameras; None: those beside each video, or its own
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Imported:
     """What one camera took: its frames, their names in the recording, their times."""
@@ -58,27 +46,42 @@ class _Imported:
     simultaneous: bool
 
 
-def import_pictures(wish: Wish, out: Path, notify: Callable[[str], None]) -> dict[str, int]:
+def import_pictures(
+    calibration: Path,
+    out: Path,
+    notify: Callable[[str], None],
+    paths: Sequence[Path] = (),
+    named: Mapping[str, Path] | None = None,
+    rig_name: str | None = None,
+    times: Path | None = None,
+) -> dict[str, int]:
     """Write the recording; return camera -> number of its frames.
 
     A former import in the same folder is replaced, nothing else is.
+
+    Args:
+        calibration: calib_json tree.
+        paths: Videos, folders of pictures, or folders of these.
+        named: Camera -> its video or folder of pictures.
+        rig_name: None: the rig that has these cameras.
+        times: Table of the times of all cameras; None: those beside each video, or its own.
 
     Raises:
         PhalanxError: A file is missing or broken, of no camera or of another size than by the camera file, or has no
             frame that can be decoded; the message states what to do.
     """
-    paths = found_in(wish.paths)
-    for path in wish.named.values():
+    paths, named = found_in(paths), named or {}
+    for path in named.values():
         if found_in([path]) != [path]:
             raise RecordingError(f"{path}: must be one video or one folder of pictures")
-    rig = rig_for(wish.calibration, wish.rig, paths, wish.named)
+    rig = rig_for(calibration, rig_name, paths, named)
     if rig.kind != "markers":
         raise RecordingError(
             f"rig {rig.name!r}: the strobed frames of a wrist device come from `phalanx-slave record`"
         )
-    if unknown := sorted(wish.named.keys() - set(rig.cameras)):
+    if unknown := sorted(named.keys() - set(rig.cameras)):
         raise RecordingError(f"--camera {unknown[0]}: rig {rig.name!r} has {', '.join(rig.cameras)}")
-    sources = [Source(camera, path) for camera, path in wish.named.items()]
+    sources = [Source(camera, path) for camera, path in named.items()]
     if paths:
         sources += sources_of(paths, rig, notify)
     if twice := {s.camera for s in sources if [o.camera for o in sources].count(s.camera) > 1}:
@@ -86,11 +89,9 @@ def import_pictures(wish: Wish, out: Path, notify: Callable[[str], None]) -> dic
     if absent := [name for name in rig.cameras if all(source.camera != name for source in sources)]:
         notify(f"rig {rig.name!r} has {', '.join(absent)}, too, of which there is nothing")
     rig = _only(rig, sources)
-    cameras: dict[str, CameraCalibration] = {}
-    for source in sources:
-        file = wish.calibration / "cameras" / f"{source.camera}.json"
-        cameras[source.camera] = load(file, CameraCalibration)
-    imported = [_imported(s, cameras[s.camera], wish, notify) for s in sources]
+    files = {s.camera: calibration / "cameras" / f"{s.camera}.json" for s in sources}
+    cameras = {name: load(file, CameraCalibration) for name, file in files.items()}
+    imported = [_imported(s, cameras[s.camera], files[s.camera], times, notify) for s in sources]
     own = [one.source for one in imported if one.simultaneous]
     if own and len(own) < len(imported):
         raise RecordingError(
@@ -107,9 +108,7 @@ def import_pictures(wish: Wish, out: Path, notify: Callable[[str], None]) -> dic
         cameras=cameras,
         rig=rig,
         note=NOTE + ", ".join(source.path.name for source in sources),
-        objects={
-            name: load(wish.calibration / "objects" / f"{name}.json", ObjectProfile) for name in rig.objects
-        },
+        objects={name: load(calibration / "objects" / f"{name}.json", ObjectProfile) for name in rig.objects},
     )
     _write(out, manifest, imported)
     return {one.source.camera: len(one.timed.number) for one in imported}
@@ -122,21 +121,24 @@ def _only(rig: RigCalibration, sources: Sequence[Source]) -> RigCalibration:
 
 
 def _imported(
-    source: Source, camera: CameraCalibration, wish: Wish, notify: Callable[[str], None]
+    source: Source,
+    camera: CameraCalibration,
+    file: Path,
+    times: Path | None,
+    notify: Callable[[str], None],
 ) -> _Imported:
     """Numbers, names and times of the frames of one camera, reported in one line."""
     size = (camera.width_px, camera.height_px)
     try:
         read = _video if source.is_video else _pictures
-        number, files, own, faults = read(source, size, camera.frame_rate_hz, wish)
+        number, files, own, faults = read(source, size, camera.frame_rate_hz, file)
     except OSError as error:
         raise RecordingError(f"{source.path}: cannot read: {error.strerror}") from error
     except PictureError as error:
         raise RecordingError(f"{source.path}: {error}") from error
-    sidecar = (
-        source.path.with_suffix(".csv") if source.is_video else source.path.parent / f"{source.path.name}.csv"
-    )
-    table = wish.times or (sidecar if sidecar.is_file() else None)
+    stem = source.path.stem if source.is_video else source.path.name
+    sidecar = source.path.parent / f"{stem}.csv"
+    table = times or (sidecar if sidecar.is_file() else None)
     timed = own if table is None else by_table(table, read_times(table, source.camera), number)
     if timed is None:
         raise RecordingError(
@@ -153,10 +155,10 @@ _Read = tuple[Int, Mapping[int, str], Timed | None, str]
 """Numbers (T,) of the frames that decode, their names in the recording, their own times, and what is broken."""
 
 
-def _video(source: Source, size: tuple[int, int], _rate_hz: float, wish: Wish) -> _Read:
+def _video(source: Source, size: tuple[int, int], _rate_hz: float, file: Path) -> _Read:
     video = VideoFrames(source.path)
     try:
-        _check_size(source, video.size_px, size, wish)
+        _check_size(source, video.size_px, size, file)
         times = video.times()
     finally:
         video.close()
@@ -167,14 +169,13 @@ def _video(source: Source, size: tuple[int, int], _rate_hz: float, wish: Wish) -
     elif times.rate_hz > 0.0:
         own = by_rate(times.number, times.rate_hz, "as the video states")
     faults = f"; {times.broken} frames between them cannot be decoded" if times.broken else ""
-    faults += (
-        f"; it ends {times.missing} frames before the {times.missing + int(times.number[-1]) + 1} that it states"
-        * (times.missing > 0)
-    )
+    if times.missing > 0:
+        stated = times.missing + int(times.number[-1]) + 1
+        faults += f"; it ends {times.missing} frames before the {stated} that it states"
     return times.number, {int(n): frame_name(name, int(n)) for n in times.number}, own, faults
 
 
-def _pictures(source: Source, size: tuple[int, int], rate_hz: float, wish: Wish) -> _Read:
+def _pictures(source: Source, size: tuple[int, int], rate_hz: float, file: Path) -> _Read:
     files: dict[int, str] = {}
     pictures = pictures_in(source.path)
     for number, picture in enumerate(pictures):
@@ -183,7 +184,7 @@ def _pictures(source: Source, size: tuple[int, int], rate_hz: float, wish: Wish)
             found = size_of(data)
         except PictureError:
             continue
-        _check_size(source, found, size, wish)
+        _check_size(source, found, size, file)
         try:
             decode(data, size)
         except PictureError:
@@ -197,12 +198,11 @@ def _pictures(source: Source, size: tuple[int, int], rate_hz: float, wish: Wish)
     return number, files, by_rate(number, rate_hz, "as the camera file states"), faults
 
 
-def _check_size(source: Source, found: tuple[int, int], size: tuple[int, int], wish: Wish) -> None:
+def _check_size(source: Source, found: tuple[int, int], size: tuple[int, int], file: Path) -> None:
     if found != size:
         raise RecordingError(
-            f"{source.path}: is of {found[0]} x {found[1]} px, the calibration"
-            f" {wish.calibration / 'cameras' / source.camera}.json of {size[0]} x {size[1]}: record in the size that"
-            " was calibrated, or calibrate in this one (`phalanx calibrate cameras stereo`)"
+            f"{source.path}: is of {found[0]} x {found[1]} px, the calibration {file} of {size[0]} x {size[1]}: record "
+            "in the size that was calibrated, or calibrate in this one (`phalanx calibrate cameras stereo`)"
         )
 
 

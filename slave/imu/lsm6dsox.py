@@ -18,13 +18,13 @@ stamps times.
 import struct
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
 from errno import EACCES, EIO, ENOENT, ENXIO, EREMOTEIO, ETIMEDOUT
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from smbus2 import SMBus, i2c_msg
@@ -33,8 +33,8 @@ from common.arrays import Float
 from common.clock import Clock
 from common.errors import ImuError
 from common.messages import ImuSample
-from slave.clocks import ClockSteppedError, DeviceClock
-from slave.sources import Reporting
+from slave.clocks import DeviceClock
+from slave.sources import NO_FIELD, ClockedImu
 
 
 class Fifo(NamedTuple):
@@ -174,24 +174,7 @@ class Slots:
 ADDRESS = 0x6A  # its pin SA0 to ground; 0x6B: to the supply
 POLL_S = 0.004
 SILENT_POLLS = 250  # without a word: it measures no more
-_NONE = (np.full(3, np.nan), np.full(4, np.nan))
 _SILENT = (EIO, ENXIO, EREMOTEIO, ETIMEDOUT)
-
-
-class Bus(Protocol):
-    """What is used of `smbus2.SMBus`."""
-
-    def write_byte_data(self, i2c_addr: int, register: int, value: int, /) -> None:
-        """Write one register."""
-        ...
-
-    def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> None:
-        """Transfer messages as one."""
-        ...
-
-    def close(self) -> None:
-        """Give the bus back."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,7 +217,7 @@ def buses(where: Path = Path("/dev")) -> list[str]:
     return [path.name.removeprefix("i2c-") for path in sorted(where.glob("i2c-*"))]
 
 
-class Lsm6dsoxImu(Reporting):
+class Lsm6dsoxImu(ClockedImu):
     """An `ImuSource` of the ST LSM6DSOX."""
 
     def __init__(
@@ -244,26 +227,23 @@ class Lsm6dsoxImu(Reporting):
         rate_hz: float,
         clock: Clock,
         stop: threading.Event,
-        opener: Callable[[int], Bus] = SMBus,
+        opener: Callable[[int], SMBus] = SMBus,
     ) -> None:
         """Open the bus, ask who is there, write and compare the settings, start.
 
         `rate_hz`: samples per second that are needed. `stop` ends the stream, also while a sample is waited for.
         Raises ImuError: no such bus, nobody answers, it is another part, or a setting did not stick.
         """
-        self._name, self._place, self._clock, self._stop = name, place, clock, stop
-        rate = rate_of(rate_hz)
-        self._slots = Slots()
-        self._came: deque[ImuSample] = deque()
-        self._counts: Counter[str] = Counter()
-        self._temperature_c = float("nan")
-        self._heated_ns: int | None = None
-        self._seq, self._stamp_ns = -1, 0
-        self._silent = 0
-        self._closed = False
         # of its oscillator, once its fine frequency is taken into account: what temperature does
         clock_error = 0.02
-        self._device_clock = DeviceClock(clock_error)
+        super().__init__(name, "LSM6DSOX", str(place), clock, stop, DeviceClock(clock_error))
+        self._place = place
+        rate = rate_of(rate_hz)
+        self._slots = Slots()
+        self._counts = self._slots.counts
+        self._came: deque[ImuSample] = deque()
+        self._heated_ns: int | None = None
+        self._silent = 0
         with self._errors():
             self._bus = opener(place.bus)
         try:
@@ -286,15 +266,6 @@ class Lsm6dsoxImu(Reporting):
         """Give the bus back. It goes on measuring."""
         self._closed = True
         self._bus.close()
-
-    def counts(self) -> Mapping[str, int]:
-        """`broken` in all and by reason, `imu.overrun` of its FIFO, `clipped` axes."""
-        counts = {**self._slots.counts, **self._counts}
-        return {"broken": sum(v for k, v in counts.items() if k.startswith("broken.")), **counts}
-
-    def metrics(self) -> Mapping[str, float]:
-        """`temperature_c` of the part."""
-        return {"temperature_c": self._temperature_c}
 
     def _begin(self, rate: Rate) -> float:
         """Set it up; how much faster than nominal its clock runs."""
@@ -328,7 +299,7 @@ class Lsm6dsoxImu(Reporting):
         temperature_ns = 1_000_000_000
         if self._heated_ns is None or arrival_ns - self._heated_ns >= temperature_ns:
             self._heated_ns = arrival_ns
-            self._temperature_c = temperature_c(self._get(Register.OUT_TEMP_L, 2))
+            self._metrics["temperature_c"] = temperature_c(self._get(Register.OUT_TEMP_L, 2))
         if not words:
             self._silent += 1
             if self._silent > SILENT_POLLS:
@@ -337,24 +308,12 @@ class Lsm6dsoxImu(Reporting):
             return
         self._silent = 0
         fresh = self._slots.push(self._get(Register.FIFO_DATA_OUT_TAG, words * FIFO.word))
-        dated = [(stamp, one) for one in fresh if (stamp := self._stamp(one.ticks, arrival_ns)) is not None]
-        self._came.extend(self._sample(stamp, one) for stamp, one in dated)
-
-    def _stamp(self, ticks: int, arrival_ns: int) -> int | None:
-        """When it was measured, by the part's clock [ns]; None: it cannot be."""
-        stamp_ns = round(ticks * self._tick_ns)
-        try:
-            possible = self._device_clock.observe(stamp_ns, arrival_ns)
-        except ClockSteppedError:
-            raise ImuError(f"{self._place}: the LSM6DSOX began anew") from None
-        self._counts["broken.time"] += not possible
-        return stamp_ns if possible else None
-
-    def _sample(self, stamp_ns: int, one: Measured) -> ImuSample:
-        passed = max(1, round((stamp_ns - self._stamp_ns) / self._period_ns)) if self._seq >= 0 else 1
-        self._seq, self._stamp_ns = self._seq + passed, stamp_ns
-        t_ns = self._device_clock.at(stamp_ns)
-        return ImuSample(self._name, 0, self._seq, t_ns, one.gyro_rad_s, one.accel_m_s2, *_NONE)
+        stamped = [(round(one.ticks * self._tick_ns), one) for one in fresh]
+        possible = [(stamp, one) for stamp, one in stamped if self._possible(stamp, arrival_ns)]
+        self._came.extend(
+            self._sample(stamp, self._period_ns, one.gyro_rad_s, one.accel_m_s2, NO_FIELD)
+            for stamp, one in possible
+        )
 
     def _set(self, register: Register, value: int) -> None:
         self._put(register, value)

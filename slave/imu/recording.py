@@ -18,7 +18,7 @@ from common.imu.csv_table import HEADERS, IMU, QUATERNION, Table, row, write_imu
 from common.imu.fusion import OrientationFilter, TiltErrors
 from common.messages import ImuSample
 from slave.report import imu_counters
-from slave.sources import ImuSource
+from slave.sources import NO_ORIENTATION, ImuSource
 
 
 class ImuRecorder:
@@ -79,9 +79,6 @@ class ImuRecorder:
             self.failure = RecordingError(f"{IMU}: ended: {error.strerror}")
 
 
-_NO_QUATERNION = np.full(4, np.nan)
-
-
 def import_table(table: Table, source: str, folder: Path | None, notify: Callable[[str], None]) -> None:
     """Compute the orientation of every sample, write imu.csv, report what it has.
 
@@ -98,9 +95,8 @@ def import_table(table: Table, source: str, folder: Path | None, notify: Callabl
     rest_s = 0.0
     for k, t_ns in enumerate(table.t_ns.tolist()):
         try:
-            sample = ImuSample(
-                source, 0, k, t_ns, table.gyro_rad_s[k], table.accel_m_s2[k], table.mag_ut[k], _NO_QUATERNION
-            )
+            rows = table.gyro_rad_s[k], table.accel_m_s2[k], table.mag_ut[k]
+            sample = ImuSample(source, 0, k, t_ns, *rows, NO_ORIENTATION)
         except ValueError as error:
             raise RecordingError(f"sample {k + 1}, at {1e-9 * t_ns:.3f} s: {error}") from error
         samples.append(fusion.push(sample))

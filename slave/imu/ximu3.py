@@ -29,13 +29,13 @@ import re
 import struct
 import termios
 import threading
-from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections import deque
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
 from errno import EACCES, EBUSY, ENOENT, EWOULDBLOCK
-from typing import NamedTuple, Protocol, cast
+from typing import NamedTuple, cast
 
 import msgspec
 import numpy as np
@@ -45,8 +45,8 @@ from serial.tools import list_ports
 from common.clock import Clock
 from common.errors import ImuError
 from common.messages import ImuSample
-from slave.clocks import ClockSteppedError, DeviceClock
-from slave.sources import Reporting
+from slave.clocks import DeviceClock
+from slave.sources import NO_FIELD, ClockedImu
 
 END, ESC, ESC_END, ESC_ESC = b"\n", b"\xdb", b"\xdb\xdc", b"\xdb\xdd"
 LONGEST = 4096  # bytes; the vendor's library drops what has not ended by then
@@ -219,29 +219,7 @@ STANDARD_GRAVITY = 9.80665  # m/s^2
 RANGE_RAD_S, RANGE_M_S2 = 1.2 * math.radians(2000.0), 1.2 * 24.0 * STANDARD_GRAVITY  # sections 3.2.1, 3.2.2
 ANSWER_S = 0.5  # an answer is sent within milliseconds
 SILENT_READS = 20  # reads without a byte since the last sample: it sends no more
-_NONE = (np.full(3, np.nan), np.full(4, np.nan))
 _LOG = logging.getLogger(__name__)
-
-
-class Port(Protocol):
-    """What is used of `serial.Serial`."""
-
-    @property
-    def in_waiting(self) -> int:
-        """How many bytes have come."""
-        ...
-
-    def read(self, size: int = 1, /) -> bytes:
-        """Wait for bytes, no longer than its timeout."""
-        ...
-
-    def write(self, b: bytes, /) -> int | None:
-        """Send bytes."""
-        ...
-
-    def close(self) -> None:
-        """Give it back."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,7 +242,7 @@ class SerialPlace:
         return cls(path, int(baud))
 
 
-def open_port(place: SerialPlace) -> Port:
+def open_port(place: SerialPlace) -> serial.Serial:
     """Open the port for this program alone; raises OSError."""
     baud = 115200
     read_s = 0.1  # a read waits so long, and looks whether it is to stop
@@ -283,17 +261,11 @@ def ports() -> list[str]:
     return lines
 
 
-class Ximu3Imu(Reporting):
+class Ximu3Imu(ClockedImu):
     """An `ImuSource` of the x-IMU3."""
 
     def __init__(
-        self,
-        name: str,
-        place: SerialPlace,
-        rate_hz: float,
-        clock: Clock,
-        stop: threading.Event,
-        opener: Callable[[SerialPlace], Port] = open_port,
+        self, name: str, place: SerialPlace, rate_hz: float, clock: Clock, stop: threading.Event
     ) -> None:
         """Open it, ask who it is, write its settings.
 
@@ -301,24 +273,18 @@ class Ximu3Imu(Reporting):
         while a sample is waited for. Raises ImuError: no such port, it may not be opened, nobody answers, or a
         setting was refused.
         """
-        self._name, self._place, self._clock, self._stop = name, place, clock, stop
+        message_bits = 340  # of one inertial message on a UART: 34 bytes with start and stop bit
+        least_ns = 0 if place.baud is None else round(1e9 * message_bits / place.baud)
+        clock_error = 200e-6  # of its crystal against the slave's, each within 100 ppm
+        super().__init__(name, "x-IMU3", place.path, clock, stop, DeviceClock(clock_error, least_ns))
         self._divisor = divisor(rate_hz)
         self._decoder = Decoder()
         self._came: deque[Data] = deque()
         self._answers: deque[Answer] = deque()
-        self._counts: Counter[str] = Counter()
-        self._metrics: dict[str, float] = {}
         self._bytes = self._silent = 0
-        self._seq = -1
-        self._stamp_us: int | None = None
-        self._mag = _NONE[0]
-        self._closed = False
+        self._mag = NO_FIELD
         with self._errors("cannot be opened"):
-            self._port = opener(place)
-        message_bits = 340  # of one inertial message on a UART: 34 bytes with start and stop bit
-        least_ns = 0 if place.baud is None else round(1e9 * message_bits / place.baud)
-        clock_error = 200e-6  # of its crystal against the slave's, each within 100 ppm
-        self._device_clock = DeviceClock(clock_error, least_ns)
+            self._port = open_port(place)
         try:
             self._begin()
         except ImuError:
@@ -330,7 +296,7 @@ class Ximu3Imu(Reporting):
         while not (self._closed or self._stop.is_set()):
             if not self._came:
                 if self._silent >= SILENT_READS:
-                    raise ImuError(f"{self._place.path}: the x-IMU3 sends no samples any more")
+                    raise ImuError(f"{self._where}: the x-IMU3 sends no samples any more")
                 self._receive()
             elif (sample := self._take(self._came.popleft())) is not None:
                 return sample
@@ -342,44 +308,35 @@ class Ximu3Imu(Reporting):
         try:
             self._port.close()
         except (OSError, termios.error):
-            _LOG.debug("%s: could not be closed", self._place.path)
-
-    def counts(self) -> Mapping[str, int]:
-        """`broken` in all and by reason, messages by kind."""
-        counts = dict(self._counts)
-        return {"broken": sum(v for k, v in counts.items() if k.startswith("broken.")), **counts}
-
-    def metrics(self) -> Mapping[str, float]:
-        """Return the last received `temperature_c` and `battery_percent`."""
-        return dict(self._metrics)
+            _LOG.debug("%s: could not be closed", self._where)
 
     def _begin(self) -> None:
         pong = self._ask("ping", None)
         if pong is None:
             received = f", though {self._bytes} bytes came" if self._bytes else ""
             raise ImuError(
-                f"{self._place.path}: no x-IMU3 answers{received}: is it switched on, is it another device, or has it "
+                f"{self._where}: no x-IMU3 answers{received}: is it switched on, is it another device, or has it "
                 "another baud rate (behind @)? `phalanx-slave doctor --ports` lists what is there"
             )
         answer = [str(pong.fields.get(part, "?")) for part in ("name", "sn", "interface")]
-        _LOG.info("%s: x-IMU3 %r, serial number %s, over %s", self._place.path, *answer)
+        _LOG.info("%s: x-IMU3 %r, serial number %s, over %s", self._where, *answer)
         over = "serial" if answer[2].lower() == "serial" else "usb"
         for key, value in settings(over, self._divisor):
             self._write(key, value)
         if self._ask("apply", None) is None:
-            raise ImuError(f"{self._place.path}: the x-IMU3 does not answer to apply its settings")
+            raise ImuError(f"{self._where}: the x-IMU3 does not answer to apply its settings")
         self._silent = 0
 
     def _write(self, key: str, value: bool | int) -> None:
         answer = self._ask(key, value)
         if answer is None:
-            raise ImuError(f"{self._place.path}: the x-IMU3 does not answer to {key}={value}")
+            raise ImuError(f"{self._where}: the x-IMU3 does not answer to {key}={value}")
         if answer.value == value:
             return
         text = answer.fields.get("error", f"it has {answer.value}")
         if key in NEEDED:
-            raise ImuError(f"{self._place.path}: the x-IMU3 refused {key}={value}: {text}")
-        _LOG.warning("%s: the x-IMU3 refused %s=%s: %s", self._place.path, key, value, text)
+            raise ImuError(f"{self._where}: the x-IMU3 refused {key}={value}: {text}")
+        _LOG.warning("%s: the x-IMU3 refused %s=%s: %s", self._where, key, value, text)
 
     def _ask(self, key: str, value: bool | int | None) -> Answer | None:
         """What it answers to a command; None: nothing, though asked repeatedly."""
@@ -404,21 +361,13 @@ class Ximu3Imu(Reporting):
         for message in self._decoder.push(data):
             if isinstance(message, Data):
                 self._counts[f"imu.{message.kind.name.lower()}"] += 1
-                if message.kind is not Kind.INERTIAL or self._dated(message, arrival_ns):
+                if message.kind is not Kind.INERTIAL or self._possible(message.t_us * 1000, arrival_ns):
                     self._came.append(message)
             elif isinstance(message, Answer):
                 self._answers.append(message)
                 self._came.clear()  # what was sent with other settings
             elif isinstance(message, Fault):
                 self._counts[f"broken.{message.name.lower()}"] += 1
-
-    def _dated(self, message: Data, arrival_ns: int) -> bool:
-        try:
-            possible = self._device_clock.observe(message.t_us * 1000, arrival_ns)
-        except ClockSteppedError:
-            raise ImuError(f"{self._place.path}: the x-IMU3 began anew, or its clock was set") from None
-        self._counts["broken.time"] += not possible
-        return possible
 
     def _take(self, message: Data) -> ImuSample | None:
         """The sample in a message, or what else there is in it kept."""
@@ -436,9 +385,7 @@ class Ximu3Imu(Reporting):
             case Kind.BATTERY:
                 self._metric("battery_percent", message.values[0])
             case Kind.NOTIFICATION | Kind.ERROR if self._counts[f"imu.{message.kind.name.lower()}"] <= logged:
-                _LOG.warning(
-                    "%s: the x-IMU3 reports: %s", self._place.path, message.text.decode(errors="replace")
-                )
+                _LOG.warning("%s: the x-IMU3 reports: %s", self._where, message.text.decode(errors="replace"))
             case _:
                 pass
         return None
@@ -450,12 +397,9 @@ class Ximu3Imu(Reporting):
         if (np.abs(gyro) > RANGE_RAD_S).any() or (np.abs(accel) > RANGE_M_S2).any():
             self._counts["broken.value"] += 1  # no checksum: bytes that were hit by noise look like this
             return None
-        period_us = 1e6 * self._divisor / SAMPLE_RATE_HZ
-        passed = 1 if self._stamp_us is None else max(1, round((message.t_us - self._stamp_us) / period_us))
-        self._seq, self._stamp_us = self._seq + passed, message.t_us
-        t_ns = self._device_clock.at(message.t_us * 1000)
-        mag, self._mag = self._mag, _NONE[0]
-        return ImuSample(self._name, 0, self._seq, t_ns, gyro, accel, mag, _NONE[1])
+        mag, self._mag = self._mag, NO_FIELD
+        period_ns = 1e9 * self._divisor / SAMPLE_RATE_HZ
+        return self._sample(message.t_us * 1000, period_ns, gyro, accel, mag)
 
     def _metric(self, name: str, value: float) -> None:
         if math.isfinite(value):
@@ -468,7 +412,7 @@ class Ximu3Imu(Reporting):
             yield
         except (OSError, termios.error, ValueError, OverflowError) as error:  # the last two: of a baud rate
             number = error.errno if isinstance(error, OSError) else None
-            raise ImuError(f"{self._place.path} {what}: {_why(number, error)}") from error
+            raise ImuError(f"{self._where} {what}: {_why(number, error)}") from error
 
 
 NEEDED = ("binary_mode_enabled", "usb_data_messages_enabled", "serial_data_messages_enabled")

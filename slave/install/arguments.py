@@ -77,42 +77,29 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--master", metavar="HOST", help="host name or address of the PC, whose clock is followed"
     )
     parser.add_argument("--rig", default="desk", help="a file in calib_json/rigs (default: %(default)s)")
-    parser.add_argument(
-        "--name",
-        dest="names",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="camera or IMU of the rig that this machine serves; once for each (default: all of the rig, if it has one "
-        "camera)",
-    )
     parser.add_argument("--role", choices=("camera", "wrist"), help="checked against the rig, if given")
-    parser.add_argument(
-        "--camera",
-        dest="cameras",
-        action="append",
-        default=[],
-        metavar="[NAME=]DRIVER",
-        help="as `phalanx-slave run --camera` has it (default: picamera2)",
+    served = (
+        "camera or IMU of the rig that this machine serves; once for each (default: all of the rig, if it has one "
+        "camera)"
     )
+    more = "more options of `phalanx-slave run`, of NAME or of all: --options 'left=--sync server'"
+    overlay = (
+        "dtoverlay of the camera in config.txt, for those that a Raspberry Pi does not find by itself: imx296"
+    )
+    for name, dest, metavar, text in (
+        ("--name", "names", "NAME", served),
+        (
+            "--camera",
+            "cameras",
+            "[NAME=]DRIVER",
+            "as `phalanx-slave run --camera` has it (default: picamera2)",
+        ),
+        ("--options", "more", "[NAME=]TEXT", more),
+        ("--overlay", "overlays", "NAME", overlay),
+    ):
+        parser.add_argument(name, dest=dest, action="append", default=[], metavar=metavar, help=text)
     parser.add_argument("--imu", metavar="DRIVER", help="as `phalanx-slave run --imu` has it")
     parser.add_argument("--lights", metavar="DRIVER", help="as `phalanx-slave run --lights` has it")
-    parser.add_argument(
-        "--options",
-        dest="more",
-        action="append",
-        default=[],
-        metavar="[NAME=]TEXT",
-        help="more options of `phalanx-slave run`, of NAME or of all: --options 'left=--sync server'",
-    )
-    parser.add_argument(
-        "--overlay",
-        dest="overlays",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="dtoverlay of the camera in config.txt, for those that a Raspberry Pi does not find by itself: imx296",
-    )
 
 
 def plan_of(options: argparse.Namespace, calibration: Mapping[str, bytes], keys: Mapping[str, bytes]) -> Plan:
@@ -121,7 +108,7 @@ def plan_of(options: argparse.Namespace, calibration: Mapping[str, bytes], keys:
     `calibration` (path below calib_json -> content) has the whole tree or what the rig needs; `keys` (file name ->
     content) a folder of a PC or of a device.
     """
-    if options.master is None or not _HOST.fullmatch(options.master):
+    if not _HOST.fullmatch(options.master or ""):
         given = f" {options.master}" if options.master else ""
         raise InstallError(f"--master{given}: give the host name or the address of the PC")
     rig = _rig(calibration, options.rig)
@@ -146,7 +133,12 @@ def _sender(name: str, rig: dict[str, Any], options: argparse.Namespace) -> Send
         raise InstallError(f"--name {name!r}: letters, digits, - and _ only")
     place = ["--name", name, "--rig", options.rig, "--calibration", CALIBRATION]
     names = _names(rig)  # options given for another machine's camera are not for this one
-    more = [word for text in _all_of(name, options.more, names) for word in _split(text)]
+    more: list[str] = []
+    for text in _all_of(name, options.more, names):
+        try:
+            more += shlex.split(text)
+        except ValueError as error:
+            raise InstallError(f"--options {text!r}: {error}") from error
     is_wrist = rig.get("kind") == "wrist"
     if options.role is not None and (options.role == "wrist") != is_wrist:
         raise InstallError(f"--role {options.role}: rig {options.rig!r} is one of kind {rig.get('kind')!r}")
@@ -177,13 +169,6 @@ def _sender(name: str, rig: dict[str, Any], options: argparse.Namespace) -> Send
         if not _UNQUOTED.fullmatch(word):
             raise InstallError(f"{word!r}: blanks and quotes cannot be in an option of a service")
     return Sender(name, tuple(words), tuple(stop_post))
-
-
-def _split(text: str) -> list[str]:
-    try:
-        return shlex.split(text)
-    except ValueError as error:
-        raise InstallError(f"--options {text!r}: {error}") from error
 
 
 def _rig(calibration: Mapping[str, bytes], name: str) -> dict[str, Any]:
@@ -251,9 +236,7 @@ def _boot(options: argparse.Namespace, drivers: Sequence[str]) -> tuple[str, ...
         lines += ["camera_auto_detect=0", *(f"dtoverlay={one}" for one in options.overlays)]
     elif any(driver.startswith("picamera2") for driver in drivers):
         lines.append("camera_auto_detect=1")
-    if any(
-        (one or "").startswith(kind) for one in (options.imu, options.lights) for kind in ("lsm6dsox", "i2c")
-    ):
+    if any((one or "").startswith(("lsm6dsox", "i2c")) for one in (options.imu, options.lights)):
         lines.append("dtparam=i2c_arm=on")
     if "/dev/serial0" in (options.imu or ""):
         lines.append("enable_uart=1")
@@ -292,28 +275,16 @@ def add_install(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--calibration", type=Path, default=Path("calib_json"), metavar="DIR", help="default: %(default)s"
     )
-    parser.add_argument(
-        "--wheelhouse",
-        type=Path,
-        metavar="DIR",
-        help="install these wheels (default: what this command runs from)",
-    )
+    text = "install these wheels (default: what this command runs from)"
+    parser.add_argument("--wheelhouse", type=Path, metavar="DIR", help=text)
     parser.add_argument("--no-apt", action="store_true", help="install no packages of the system")
     parser.add_argument("--dry-run", action="store_true", help="write nothing; report what would be changed")
     ends = parser.add_mutually_exclusive_group()
-    ends.add_argument(
-        "--rollback",
-        action="store_true",
-        help="go back to release, options, keys and calibration as they were before the last installation",
-    )
+    text = "go back to release, options, keys and calibration as they were before the last installation"
+    ends.add_argument("--rollback", action="store_true", help=text)
     ends.add_argument("--uninstall", action="store_true", help="take everything away again")
-    parser.add_argument(
-        "--ready-s",
-        type=float,
-        default=READY_S,
-        metavar="S",
-        help="until slaves are ready (default: %(default)g)",
-    )
+    text = "until slaves are ready (default: %(default)g)"
+    parser.add_argument("--ready-s", type=float, default=READY_S, metavar="S", help=text)
     parser.add_argument("--settle-s", type=float, default=SETTLE_S, help=argparse.SUPPRESS)
     parser.add_argument("--root", type=Path, default=Path("/"), help=argparse.SUPPRESS)
     parser.add_argument("--bundle", type=Path, help=argparse.SUPPRESS)  # keys and calibration, from the PC

@@ -36,10 +36,10 @@ def from_archive(archive: Path) -> tuple[dict[str, bytes], dict[str, bytes]]:
     try:
         with zipfile.ZipFile(archive) as opened:
             names = [name for name in opened.namelist() if not name.endswith("/")]
-            keys = {n.removeprefix(KEYS): opened.read(n) for n in names if n.startswith(KEYS)}
-            calibration = {
-                n.removeprefix(CALIBRATION): opened.read(n) for n in names if n.startswith(CALIBRATION)
-            }
+            keys, calibration = (
+                {n.removeprefix(place): opened.read(n) for n in names if n.startswith(place)}
+                for place in (KEYS, CALIBRATION)
+            )
     except (OSError, zipfile.BadZipFile) as error:
         raise InstallError(f"{archive}: not what the PC sends ({error})") from error
     return keys, calibration
@@ -65,9 +65,8 @@ def keys_of(folder: Path | None) -> dict[str, bytes]:
     found: dict[str, bytes] = {}
     for path in sorted([*folder.glob("*"), *folder.glob("devices/*")]):
         name = path.relative_to(folder).as_posix()
-        if name in ("rig.key", "ca.pem") or name.startswith(("devices/", "device-", "device.")):
-            if not path.is_file():
-                continue
+        ours = name in ("rig.key", "ca.pem") or name.startswith(("devices/", "device-", "device."))
+        if ours and path.is_file():
             if path.suffix in (".key", ".secret") and stat.S_IMODE(path.stat().st_mode) & _SHARED:
                 raise InstallError(f"{path}: others can read this key; run: chmod 600 {path}")
             found[name] = path.read_bytes()
@@ -96,23 +95,22 @@ def run(options: argparse.Namespace, notify: Notify, systemd: Systemd | None = N
             raise InstallError("only root can install a service: sudo phalanx-slave install ...")
         done = _act(options, machine)
     except InstallError as error:
-        return _end(options, notify, {"error": str(error)}, f"phalanx-slave: {error}", 1)
+        why = str(error)
     except OSError as error:
-        text = f"{error.filename or options.root}: {error.strerror or error}"
-        return _end(options, notify, {"error": text}, f"phalanx-slave: {text}", 1)
-    return _end(options, notify, done, str(done.get("text", "done")), 0)
+        why = f"{error.filename or options.root}: {error.strerror or error}"
+    else:
+        notify(json.dumps({"result": done}) if options.json else str(done["text"]))
+        return 0
+    notify(json.dumps({"result": {"error": why}}) if options.json else f"phalanx-slave: {why}")
+    return 1
 
 
 def _act(options: argparse.Namespace, machine: steps.Machine) -> dict[str, object]:
     if options.uninstall:
         gone = uninstall(machine, options.dry_run)
         would = "would remove" if options.dry_run else "removed"
-        text = (
-            f"{would} {', '.join('/' + path for path in gone)}; packages of apt stay"
-            if gone
-            else "nothing of ours is there"
-        )
-        return {"removed": gone, "text": text}
+        text = f"{would} {', '.join('/' + path for path in gone)}; packages of apt stay"
+        return {"removed": gone, "text": text if gone else "nothing of ours is there"}
     if options.rollback:
         return {"text": steps.roll_back(machine, options.dry_run)}
     if options.bundle is not None:
@@ -135,8 +133,7 @@ def _act(options: argparse.Namespace, machine: steps.Machine) -> dict[str, objec
 def _clear(stage: Path) -> None:
     """Remove what the PC sent for this installation, or others cut off long ago."""
     for one in stage.parent.glob("*"):
-        left_s = 3600.0  # no installation takes so long
-        if one == stage or time.time() - one.stat().st_mtime > left_s:
+        if one == stage or time.time() - one.stat().st_mtime > 3600.0:  # no installation takes an hour
             shutil.rmtree(one, ignore_errors=True)
     with contextlib.suppress(OSError):  # somebody else's are there
         stage.parent.rmdir()
@@ -161,17 +158,13 @@ def _prepare(options: argparse.Namespace, picamera2: bool, machine: steps.Machin
     facts = probe(options.root, camera)
     if (why := judge(facts, camera, not options.no_apt)) is not None:
         raise InstallError(why)
-    wanted = missing_packages(facts["packages"], picamera2)
+    wanted = ["chrony", *(["python3-picamera2"] if picamera2 else [])]
+    missing = [name for name in wanted if name not in facts["packages"]]
     if options.no_apt or options.dry_run:
-        for name in wanted:
+        for name in missing:
             machine.notify(f"not installed: {name}")
         return
-    packages(wanted, machine)
-
-
-def missing_packages(there: list[str], picamera2: bool) -> list[str]:
-    """What apt has to bring."""
-    return [name for name in ("chrony", *(["python3-picamera2"] if picamera2 else [])) if name not in there]
+    packages(missing, machine)
 
 
 def _start_s(systemd: Systemd) -> float | None:
@@ -182,11 +175,6 @@ def _start_s(systemd: Systemd) -> float | None:
     except InstallError:
         return None
     return max((one for one in took if one is not None), default=None)
-
-
-def _end(options: argparse.Namespace, notify: Notify, result: dict[str, object], text: str, code: int) -> int:
-    notify(json.dumps({"result": result}) if options.json else text)
-    return code
 
 
 def main(arguments: list[str], notify: Notify, systemd: Systemd | None = None) -> int:
@@ -214,8 +202,6 @@ def main(arguments: list[str], notify: Notify, systemd: Systemd | None = None) -
     if action != "install":
         sys.stderr.write("python3 -m slave.install install|probe|packages ...; `install --help` says more\n")
         return 0 if action in ("-h", "--help") else 2
-    parser = argparse.ArgumentParser(
-        "slave.install", description="Install slaves as services of this machine."
-    )
+    parser = argparse.ArgumentParser("slave.install", description="Install slaves as services.")
     add_install(parser)
     return run(parser.parse_args(rest), notify, systemd)

@@ -121,9 +121,8 @@ def _cameras() -> list[str] | None:
 def _output_of(command: list[str]) -> str | None:
     """Output of a command; None: it does not exist, failed, or takes too long."""
     try:
-        quick_s = 20.0
         done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=quick_s, check=False
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=20.0, check=False
         )
     except (OSError, subprocess.TimeoutExpired):
         return None

@@ -24,7 +24,7 @@ from importlib.metadata import distributions
 from pathlib import Path
 
 from slave.install.arguments import InstallError
-from slave.install.systemd import run_command
+from slave.install.systemd import finished, run_command
 from slave.install.wanted import OPT
 
 RELEASES = f"{OPT}/releases"
@@ -44,44 +44,41 @@ sys.exit(main())
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Packages of a release: a folder of `wheels`, or the site-packages `site`."""
+    """Packages of a release: a folder of wheels, or site-packages."""
 
-    wheels: Path | None
-    site: Path | None = None
+    folder: Path
+    wheels: bool = True
 
     @staticmethod
     def here() -> Source:
         """The environment that this runs in."""
-        return Source(None, Path(sysconfig.get_path("purelib")))
-
-    def _release(self) -> str | None:
-        """The release that the installer runs from, if it does: only files change then."""
-        assert self.site is not None
-        parts = self.site.resolve().parts
-        return parts[4] if parts[:4] == ("/", *RELEASES.split("/")) and len(parts) > 4 else None
+        return Source(Path(sysconfig.get_path("purelib")), wheels=False)
 
     def name(self) -> str:
-        """Version and a hash of all that is in it: other content is another release."""
-        digest = hashlib.sha256()
-        if self.wheels is not None:
-            wheels = sorted(self.wheels.glob("*.whl"))
+        """Version and a hash of all that is in it: other content is another release.
+
+        Where the installer runs from a release only files change, so that is the name.
+        """
+        digest, folder = hashlib.sha256(), self.folder
+        if self.wheels:
+            wheels = sorted(folder.glob("*.whl"))
             for wheel in wheels:
                 digest.update(wheel.name.encode() + hashlib.sha256(wheel.read_bytes()).digest())
             versions = [w.name.split("-")[1] for w in wheels if w.name.startswith("phalanx_hand-")]
-            where = self.wheels
         else:
-            assert self.site is not None
-            if (own := self._release()) is not None:
-                return own
-            for package in distributions(path=[str(self.site)]):
+            parts = folder.resolve().parts
+            if parts[:4] == ("/", *RELEASES.split("/")) and len(parts) > 4:
+                return parts[4]
+            packages = list(distributions(path=[str(folder)]))
+            for package in packages:
                 digest.update((package.read_text("RECORD") or package.name).encode())
-            for file in sorted(_own_packages(self.site).rglob("*.py")):
-                if file.relative_to(_own_packages(self.site)).parts[0] in _PACKAGES:
+            own = _own_packages(folder)
+            for file in sorted(own.rglob("*.py")):
+                if file.relative_to(own).parts[0] in _PACKAGES:
                     digest.update(file.read_bytes())
-            versions = [one.version for one in distributions(path=[str(self.site)]) if one.name == OURS]
-            where = self.site
+            versions = [one.version for one in packages if one.name == OURS]
         if not versions:
-            raise InstallError(f"{where}: no {OURS} in it")
+            raise InstallError(f"{folder}: no {OURS} in it")
         return f"{versions[-1]}-{digest.hexdigest()[:8]}"
 
 
@@ -98,11 +95,7 @@ def make(root: Path, name: str, source: Source, notify: Callable[[str], None]) -
     notify(f"making release {name}")
     try:
         venv.EnvBuilder(system_site_packages=True, symlinks=True, with_pip=False).create(fresh)
-        if source.wheels is not None:
-            _install_wheels(fresh, source.wheels)
-        else:
-            assert source.site is not None
-            _copy_site(fresh, source.site)
+        (_install_wheels if source.wheels else _copy_site)(fresh, source.folder)
         _settle(fresh, releases / name, root)
         os.sync()
         fresh.rename(releases / name)
@@ -134,15 +127,13 @@ def remove(root: Path, name: str) -> None:
 
 
 def _check_space(releases: Path, source: Source) -> None:
-    if source.wheels is not None:
-        sizes = [zipfile.ZipFile(wheel).infolist() for wheel in source.wheels.glob("*.whl")]
-        size = sum(item.file_size for items in sizes for item in items)
+    if source.wheels:
+        contents = [zipfile.ZipFile(wheel).infolist() for wheel in source.folder.glob("*.whl")]
+        size = sum(item.file_size for items in contents for item in items)
     else:
-        assert source.site is not None
-        size = sum(file.stat().st_size for file in source.site.rglob("*") if file.is_file())
-    unpacked = 1.4  # what is compiled and what a disk rounds up, share of what is unpacked
-    spare_mb = 50.0
-    needed_mb = size * 1e-6 * unpacked + spare_mb
+        size = sum(file.stat().st_size for file in source.folder.rglob("*") if file.is_file())
+    # 0.4 of it for what is compiled and what a disk rounds up, and something to spare
+    needed_mb = size * 1e-6 * 1.4 + 50.0
     free_mb = shutil.disk_usage(releases).free * 1e-6
     if free_mb < needed_mb:
         raise InstallError(
@@ -161,41 +152,19 @@ def _install_wheels(fresh: Path, wheels: Path) -> None:
         raise InstallError(
             f"{wheels}: no wheel of pip in it, and this system has no pip; on a PC `phalanx fleet wheels DIR` has all"
         )
-    pip = [sys.executable, str(pips[-1] / "pip")] if pips else [sys.executable, "-m", "pip"]
-    python = str(fresh / "bin/python")
-    command = [
-        *pip,
-        "--python",
-        python,
-        "install",
-        "--no-index",
-        "--find-links",
-        str(wheels),
-        *_QUIET,
-        *names,
-    ]
+    command = [sys.executable, str(pips[-1] / "pip")] if pips else [sys.executable, "-m", "pip"]
+    command += ["--python", str(fresh / "bin/python"), "install", "--no-index", "--find-links", str(wheels)]
+    command += ["--ignore-installed", "--no-compile", "--disable-pip-version-check", "--no-input", "--quiet"]
+    command += ["--root-user-action=ignore", *names]
     pip_s = 1500.0  # under emulation, too
     try:
-        done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=pip_s, check=False
-        )
+        done = finished(command, pip_s)
     except subprocess.TimeoutExpired as error:
         raise InstallError(f"pip: no end after {pip_s:.0f} s") from error
     if done.returncode != 0:
-        errors = [line for line in done.stderr.splitlines() if line.startswith("ERROR:")] or [
-            done.stderr[-300:]
-        ]
-        raise InstallError(f"{wheels}: {errors[-1].removeprefix('ERROR: ').strip()}")
-
-
-_QUIET = (
-    "--ignore-installed",
-    "--no-compile",
-    "--disable-pip-version-check",
-    "--no-input",
-    "--quiet",
-    "--root-user-action=ignore",
-)
+        errors = [line for line in done.stderr.splitlines() if line.startswith("ERROR:")]
+        why = errors[-1].removeprefix("ERROR: ") if errors else done.stderr[-300:]
+        raise InstallError(f"{wheels}: {why.strip()}")
 
 
 def _copy_site(fresh: Path, site: Path) -> None:
@@ -222,8 +191,7 @@ def _settle(fresh: Path, final: Path, root: Path) -> None:
     if not (fresh / "bin/phalanx-slave").is_file():
         raise InstallError(f"release {final.name}: has no phalanx-slave; is its wheel whole?")
     try:
-        loads_s = 300.0
-        run_command([str(fresh / "bin/python"), "-I", "-c", _LOADS], loads_s)
+        run_command([str(fresh / "bin/python"), "-I", "-c", _LOADS], 300.0)
     except InstallError as error:
         raise InstallError(f"release {final.name} does not load: {str(error).partition(': ')[2]}") from error
     for script in (fresh / "bin").iterdir():

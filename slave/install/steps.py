@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from slave.install import release
-from slave.install.arguments import OF_DEVICE, InstallError, NotReadyError, Plan, Sender
+from slave.install.arguments import InstallError, NotReadyError, Plan, Sender, wanted_keys
 from slave.install.release import Source
 from slave.install.systemd import Systemd, run_command
 from slave.install.transaction import CURRENT, Transaction, alone, changed, point, remove, write
@@ -29,8 +29,7 @@ from slave.install.wanted import (
     UNIT,
     File,
     Record,
-    own_groups,
-    recorded,
+    missing_groups,
     wanted_files,
     without_block,
 )
@@ -54,14 +53,12 @@ class Machine:
         While it is waited for, its camera sees nothing: so it is judged by its own last start on this machine.
         """
         took_s = self.systemd.state(unit).start_s
-        # even a slave that starts in one second has so long, on a machine that is busy with its new release
-        least_s = 10.0
-        times = 4.0
-        return self.ready_s if took_s is None else min(self.ready_s, max(least_s, times * took_s))
+        # 10 s even for one that starts in one second, on a machine that is busy with its new release
+        return self.ready_s if took_s is None else min(self.ready_s, max(10.0, 4.0 * took_s))
 
-    def alone(self) -> contextlib.AbstractContextManager[None]:
-        """Hold the machine while nobody else installs on it; see `transaction.alone`."""
-        return alone(self.root, self.notify, self.systemd.sleep)
+    def alone(self, dry_run: bool) -> contextlib.AbstractContextManager[None]:
+        """Hold the machine while nobody else installs on it, unless nothing is written."""
+        return contextlib.nullcontext() if dry_run else alone(self.root, self.notify, self.systemd.sleep)
 
 
 @dataclass(slots=True)
@@ -77,15 +74,15 @@ class Outcome:
 
 def install(plan: Plan, source: Source, name: str, machine: Machine, dry_run: bool = False) -> Outcome:
     """Bring the machine to the plan with release `name`, unless it is there already."""
-    with contextlib.nullcontext() if dry_run else machine.alone():
+    with machine.alone(dry_run):
         notes = Transaction(machine.root)
         if notes.is_open and not dry_run:
             machine.notify("an installation before was cut off: taking it back")
             _take_back(machine)
         record = Record.read(machine.root)
         files = wanted_files(plan, machine.root, record)
-        groups = record.groups + tuple(g for g in own_groups() if not _has_group(machine.root, g))
-        files[RECORD] = recorded(plan, tuple(dict.fromkeys(groups))).file()
+        groups = (*record.groups, *missing_groups(machine.root))
+        files[RECORD] = Record.of(plan, tuple(dict.fromkeys(groups))).file()
         outcome = _difference(plan, files, name, machine)
         if dry_run:
             for path in outcome.changed:
@@ -111,7 +108,7 @@ def install(plan: Plan, source: Source, name: str, machine: Machine, dry_run: bo
 
 def roll_back(machine: Machine, dry_run: bool = False) -> str:
     """Go back to the state before the last installation; what is there, in a line."""
-    with contextlib.nullcontext() if dry_run else machine.alone():
+    with machine.alone(dry_run):
         left, before = _current(machine.root), Transaction(machine.root).release_before
         text = f"release {before}" if before else "no release, as before the first installation"
         if dry_run:
@@ -127,13 +124,10 @@ def _difference(plan: Plan, files: dict[str, File | None], name: str, machine: M
     outcome = Outcome(name, changed(machine.root, files))
     if _current(machine.root) != name:
         outcome.changed.append(CURRENT)
-    everybodys = {UNIT, SYSUSERS, CURRENT, f"{KEYS}/rig.key", f"{KEYS}/ca.pem"} & set(outcome.changed)
+    everybodys = {UNIT, SYSUSERS, CURRENT, f"{KEYS}/rig.key", f"{KEYS}/ca.pem"}
     for sender in plan.senders:
-        own = {
-            f"{ETC}/{sender.name}.env",
-            *(f"{KEYS}/device-{sender.name}.{kind}" for kind in OF_DEVICE),
-        }
-        if everybodys or own & set(outcome.changed) or not machine.systemd.state(sender.unit).active:
+        own = {f"{ETC}/{sender.name}.env", *(f"{KEYS}/{file}" for file in wanted_keys([sender.name]))}
+        if (everybodys | own) & set(outcome.changed) or not machine.systemd.state(sender.unit).active:
             outcome.restarted.append(sender.unit)
     outcome.reboot = BOOT in outcome.changed
     return outcome
@@ -224,42 +218,40 @@ def _senders(root: Path) -> set[str]:
     return {path.stem for path in (root / ETC).glob("*.env")}
 
 
-def _has_group(root: Path, group: str) -> bool:
-    try:
-        return any(line.startswith(f"{group}:") for line in (root / "etc/group").read_text().splitlines())
-    except FileNotFoundError:
-        return False
-
-
 _STATE = ("var/lib/phalanx", "var/cache/phalanx", "var/log/phalanx")
 _PRIVATE = ("var/lib/private/phalanx", "var/cache/private/phalanx", "var/log/private/phalanx")
 
 
 def uninstall(machine: Machine, dry_run: bool = False) -> list[str]:
     """Remove it; what was there, as paths below the root."""
-    with contextlib.nullcontext() if dry_run else machine.alone():
-        return _remove(machine, dry_run)
+    with machine.alone(dry_run):
+        there = _there(machine.root)
+        if there and not dry_run:
+            _remove(there, machine)
+        return there
 
 
-def _remove(machine: Machine, dry_run: bool) -> list[str]:
+def _there(root: Path) -> list[str]:
+    """What is ours, as paths below the root."""
+    own = [UNIT, SYSUSERS, CHRONY, ETC, OPT, *_STATE, *_PRIVATE]
+    drop_ins = (root / "etc/systemd/system").glob("phalanx-slave@*.service.d")
+    own += [str(path.relative_to(root)) for path in drop_ins]
+    there = [path for path in own if (root / path).exists() or (root / path).is_symlink()]
+    text = _boot_text(root)
+    return there if without_block(text) == text else [*there, BOOT]
+
+
+def _boot_text(root: Path) -> str:
+    return (root / BOOT).read_text(errors="surrogateescape") if (root / BOOT).is_file() else ""
+
+
+def _remove(there: list[str], machine: Machine) -> None:
     root, run = machine.root, machine.systemd.run
     try:
         groups = Record.read(root).groups
     except InstallError:  # then they stay; all else goes
         groups = ()
     units = [_UNITS.format(name) for name in sorted(_senders(root))]
-    own = [UNIT, SYSUSERS, CHRONY, ETC, OPT, *_STATE, *_PRIVATE]
-    own += [
-        str(path.relative_to(root))
-        for path in (root / "etc/systemd/system").glob("phalanx-slave@*.service.d")
-    ]
-    there = [path for path in own if (root / path).exists() or (root / path).is_symlink()]
-    boot = root / BOOT
-    text = boot.read_text(errors="surrogateescape") if boot.is_file() else ""
-    if without_block(text) != text:
-        there.append(BOOT)
-    if dry_run or not there:
-        return there
     if units:
         machine.notify(f"stopping {', '.join(units)}")
         run(["systemctl", "disable", "--now", "--quiet", *units])
@@ -267,7 +259,7 @@ def _remove(machine: Machine, dry_run: bool) -> list[str]:
         machine.notify(f"removing {'our lines of ' if path == BOOT else ''}/{path}")
         target = root / path
         if path == BOOT:
-            write(root, BOOT, File(without_block(text).encode(errors="surrogateescape"), 0o755))
+            write(root, BOOT, File(without_block(_boot_text(root)).encode(errors="surrogateescape"), 0o755))
         elif target.is_dir() and not target.is_symlink():
             shutil.rmtree(target)
         else:
@@ -283,8 +275,7 @@ def _remove(machine: Machine, dry_run: bool) -> list[str]:
             run(["systemctl", "try-reload-or-restart", "chrony.service"])
     for group in groups:
         with contextlib.suppress(InstallError):  # somebody else may have removed it, or may use it
-            machine.systemd.run(["groupdel", group])
-    return there
+            run(["groupdel", group])
 
 
 def packages(names: list[str], machine: Machine) -> None:

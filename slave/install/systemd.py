@@ -125,9 +125,8 @@ class Systemd:
             for unit in limits:
                 state = self.state(unit)
                 first[unit] = min(first[unit], state.restarts)  # a start by hand begins to count again
-                # ends after which it is not going to run; each second of waiting is one without its camera
-                tries = 2
-                if state.restarts >= first[unit] + tries:
+                # after two ends it is not going to run; each second of waiting is one without its camera
+                if state.restarts >= first[unit] + 2:
                     raise NotReadyError(f"{unit} ends again and again: {self._why(unit, state, since)}")
                 if not state.active:
                     steady.pop(unit, None)
@@ -148,8 +147,7 @@ class Systemd:
                 raise NotReadyError(f"{late[0]} is not ready after {passed_s:.0f} s: {why}")
             if stayed and self._now() > max(ends.values()) + settle_s:
                 raise NotReadyError(f"{next(iter(limits))} does not stay ready for {settle_s:g} s")
-            step_s = 0.25
-            self.sleep(step_s)
+            self.sleep(0.25)
 
     def _why(self, unit: str, state: UnitState, since: float, pid: int = 0) -> str:
         """Last log line of a unit since a time [s since 1970], or how systemd ended it."""

@@ -247,8 +247,7 @@ def alone(root: Path, notify: Callable[[str], None], sleep: Callable[[float], No
                     notify(
                         f"another installation runs on this machine: waiting for its end, at most {wait_s} s"
                     )
-                poll_s = 1.0
-                sleep(poll_s)
+                sleep(1.0)
         else:
             raise InstallError(
                 f"another installation still runs on this machine after {wait_s} s; to see it there: "

@@ -12,7 +12,8 @@ import os
 import pkgutil
 import re
 import ssl
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -88,6 +89,11 @@ class Record:
     groups: tuple[str, ...] = ()  # groups of the system that we made
 
     @staticmethod
+    def of(plan: Plan, groups: tuple[str, ...]) -> Record:
+        """What is to be remembered of the installation of a plan."""
+        return Record({path: _hash(content) for path, content in plan.calibration.items()}, groups)
+
+    @staticmethod
     def read(root: Path) -> Record:
         """That of this machine; empty before the first installation."""
         try:
@@ -124,15 +130,13 @@ def wanted_files(plan: Plan, root: Path, record: Record) -> dict[str, File | Non
     return files | _calibration(plan, root, record)
 
 
-def recorded(plan: Plan, groups: tuple[str, ...]) -> Record:
-    """What is to be remembered of this installation."""
-    return Record({path: _hash(content) for path, content in plan.calibration.items()}, groups)
-
-
-def own_groups() -> list[str]:
-    """The groups that our sysusers file asks for."""
+def missing_groups(root: Path) -> list[str]:
+    """The groups that our sysusers file asks for and the system has not."""
+    file = root / "etc/group"
+    groups = file.read_text().splitlines() if file.is_file() else []
+    there = {line.partition(":")[0] for line in groups}
     lines = _own("phalanx.sysusers.conf").decode().splitlines()
-    return [line.split()[1] for line in lines if line.startswith("g ")]
+    return [line.split()[1] for line in lines if line.startswith("g ") and line.split()[1] not in there]
 
 
 def check_keys(keys: Mapping[str, bytes], names: tuple[str, ...]) -> None:
@@ -150,27 +154,20 @@ def check_keys(keys: Mapping[str, bytes], names: tuple[str, ...]) -> None:
     for name in names:
         with _in_memory(keys[f"device-{name}.pem"]) as pem, _in_memory(keys[f"device-{name}.key"]) as key:
             try:
-                context.load_cert_chain(pem.path, key.path, password=lambda: b"")
+                context.load_cert_chain(pem, key, password=lambda: b"")
             except (ssl.SSLError, OSError, ValueError) as error:
                 raise InstallError(
                     f"keys: device-{name}.pem and device-{name}.key are no certificate and its key ({error})"
                 ) from error
 
 
-class _in_memory:  # noqa: N801 - reads as a function
-    """A file that is on no disk, for libraries that only open paths."""
-
-    def __init__(self, content: bytes) -> None:
-        self._descriptor = os.memfd_create("phalanx")
-        with open(self._descriptor, "wb", closefd=False) as file:
-            file.write(content)
-        self.path = f"/proc/self/fd/{self._descriptor}"
-
-    def __enter__(self) -> _in_memory:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        os.close(self._descriptor)
+@contextmanager
+def _in_memory(content: bytes) -> Generator[str]:
+    """Path of a file that is on no disk, for libraries that only open paths."""
+    with open(os.memfd_create("phalanx"), "wb") as file:  # noqa: PTH123 - a descriptor
+        file.write(content)
+        file.flush()
+        yield f"/proc/self/fd/{file.fileno()}"
 
 
 def _keys(plan: Plan, root: Path) -> dict[str, File | None]:
@@ -195,12 +192,11 @@ def _gone(plan: Plan, root: Path) -> dict[str, File | None]:
 
 def _calibration(plan: Plan, root: Path, record: Record) -> dict[str, File | None]:
     """Files that the PC changed since the last time; what a slave saved stays."""
-    files: dict[str, File | None] = {}
-    for path, content in plan.calibration.items():
-        there = (root / CALIB / path).exists()
-        if not there or _hash(content) != record.calibration.get(path):
-            files[f"{CALIB}/{path}"] = File(content)
-    return files
+    return {
+        f"{CALIB}/{path}": File(content)
+        for path, content in plan.calibration.items()
+        if not (root / CALIB / path).exists() or _hash(content) != record.calibration.get(path)
+    }
 
 
 def _own(name: str) -> bytes:

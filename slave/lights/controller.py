@@ -88,11 +88,6 @@ class StrobeSchedule:
         """Of a pulse as planned [ns]."""
         return self._lead_ns + 2 * self._half_ns + MARGIN_NS
 
-    @property
-    def ready(self) -> bool:
-        """Whether exposures are known well enough."""
-        return self._line is not None
-
     def push(self, seq: int, t_ns: int) -> bool:
         """Take a mid-exposure [ns]; whether a new line begins, counted from `seq`."""
         if not self._stamps:
@@ -161,23 +156,54 @@ class StrobeSchedule:
 
 
 FAILED_NS = 500_000_000  # after a driver has failed, no light for so long; then it is tried again
-EVENTS = ("skipped", "late")
 _LOG = logging.getLogger(__name__)
 
 
-class Strober:
-    """Switches the light of each frame.
+class Strobe:
+    """Switches the light of each frame, as predicted from the stamps of those before.
 
-    `counts`: pulses `skipped`, as it was too late for them; `late`, ended at once, as the driver took too long.
+    `missed`: pulses `skipped`, as it was too late for them; `late`, ended at once, as the driver took too long.
     """
 
     def __init__(self, schedule: StrobeSchedule, interlock: Interlock, clock: Clock) -> None:
         self._schedule, self._interlock, self._clock = schedule, interlock, clock
+        self._news = threading.Condition()
         self._on: Pulse | None = None
         self._number = -1
         self._rest_until_ns: int | None = None
         self._logged_ns: int | None = None
-        self.counts: Counter[str] = Counter(dict.fromkeys(EVENTS, 0))
+        self.missed = Counter({"skipped": 0, "late": 0})
+
+    def push(self, seq: int, t_ns: int) -> None:
+        """Take a frame's mid-exposure [ns]."""
+        with self._news:
+            if self._schedule.push(seq, t_ns):
+                self._number = -1
+            self._news.notify_all()
+
+    def expose(self, exposure_us: float) -> None:
+        """Take another exposure time [us]."""
+        with self._news:
+            self._schedule.expose(exposure_us)
+
+    def stalled(self) -> None:
+        """Go dark, and forget the stamps: there are no frames any more."""
+        with self._news:
+            self._schedule.forget()
+            self._number = -1
+            self._dark()
+            self._news.notify_all()
+
+    def counts(self) -> dict[str, int]:
+        """`lights.<event>` -> how often, of lights, strobe and schedule."""
+        own = {**self._interlock.events(), **self.missed, "restarts": self._schedule.restarts}
+        return {f"lights.{event}": count for event, count in own.items()}
+
+    def close(self) -> None:
+        """Go dark, give the lights back. Safe to call twice."""
+        with self._news:
+            self._dark()
+        self._interlock.close()
 
     def step(self) -> int | None:
         """Do what is due; when to come again [ns], None: when there is another frame."""
@@ -192,7 +218,7 @@ class Strober:
             self._log_fault(now_ns, error)
             return self._rest_until_ns
 
-    def dark(self) -> None:
+    def _dark(self) -> None:
         """End what is on, now: the camera has stopped, or all ends."""
         self._on = None
         try:
@@ -210,7 +236,7 @@ class Strober:
             self._number = self._schedule.before(now_ns)
         pulse = self._schedule.after(self._number)
         while pulse is not None and now_ns > pulse.latest_ns:
-            self.counts["skipped"] += 1
+            self.missed["skipped"] += 1
             self._number = pulse.number
             pulse = self._schedule.after(self._number)
         if pulse is None or now_ns < pulse.on_ns:
@@ -219,15 +245,11 @@ class Strober:
         if not self._interlock.begin(pulse.lit, pulse.off_ns - now_ns):
             return pulse.off_ns
         if self._clock.now_ns() > pulse.latest_ns:
-            self.counts["late"] += 1
+            self.missed["late"] += 1
             self._interlock.end()
         else:
             self._on = pulse
         return pulse.off_ns
-
-    def renumber(self) -> None:
-        """The frames are counted anew."""
-        self._number = -1
 
     def _log_fault(self, now_ns: int, error: LightsError) -> None:
         if self._logged_ns is None or now_ns - self._logged_ns >= 10_000_000_000:  # one line in ten seconds
@@ -235,71 +257,20 @@ class Strober:
             _LOG.warning("lights: %s", error)
 
 
-class Strobe:
-    """Keeps a camera lit: schedule, fed by `push`, strober, lights."""
-
-    def __init__(self, schedule: StrobeSchedule, interlock: Interlock, clock: Clock) -> None:
-        self._schedule, self._interlock, self._clock = schedule, interlock, clock
-        self._strober = Strober(schedule, interlock, clock)
-
-    def push(self, seq: int, t_ns: int) -> None:
-        """Take a frame's mid-exposure [ns]."""
-        if self._schedule.push(seq, t_ns):
-            self._strober.renumber()
-
-    def expose(self, exposure_us: float) -> None:
-        """Take another exposure time [us]."""
-        self._schedule.expose(exposure_us)
-
-    def stalled(self) -> None:
-        """Go dark, and forget the stamps: there are no frames any more."""
-        self._schedule.forget()
-        self._strober.renumber()
-        self._strober.dark()
-
-    def counts(self) -> dict[str, int]:
-        """`lights.<event>` -> how often, of lights, strober and schedule."""
-        own = {**self._interlock.events(), **self._strober.counts, "restarts": self._schedule.restarts}
-        return {f"lights.{event}": count for event, count in own.items()}
-
-    def close(self) -> None:
-        """Go dark, give the lights back. Safe to call twice."""
-        self._strober.dark()
-        self._interlock.close()
-
-
 class StrobeController(Strobe):
-    """A strobe that works on a thread of its own, under one lock."""
+    """A strobe that works on a thread of its own."""
 
     def __init__(self, schedule: StrobeSchedule, interlock: Interlock, clock: Clock) -> None:
         super().__init__(schedule, interlock, clock)
-        self._news = threading.Condition()
         self._closed = False
         self._thread = threading.Thread(target=self._work, name="strobe", daemon=True)
         self._thread.start()
-
-    def push(self, seq: int, t_ns: int) -> None:
-        """As of `Strobe`."""
-        with self._news:
-            super().push(seq, t_ns)
-            self._news.notify_all()
-
-    def expose(self, exposure_us: float) -> None:
-        """As of `Strobe`."""
-        with self._news:
-            super().expose(exposure_us)
-
-    def stalled(self) -> None:
-        """As of `Strobe`."""
-        with self._news:
-            super().stalled()
-            self._news.notify_all()
 
     def close(self) -> None:
         """Go dark, end the thread, give the lights back; as of `Strobe`."""
         with self._news:
             self._closed = True
-            self._strober.dark()
+            self._dark()
             self._news.notify_all()
         self._thread.join()
         self._interlock.close()
@@ -308,10 +279,10 @@ class StrobeController(Strobe):
         with self._news:
             try:
                 while not self._closed:
-                    again_ns = self._strober.step()
+                    again_ns = self.step()
                     if again_ns is None:
                         self._news.wait(0.5)  # there are no frames
                     elif (left_s := (again_ns - self._clock.now_ns()) * 1e-9) > 0.0:
                         self._news.wait(left_s)
             finally:
-                self._strober.dark()
+                self._dark()

@@ -15,7 +15,7 @@ import errno
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -64,7 +64,8 @@ class GpioLights(Lights):
         names = lines.split(",")
         if not colon or not chip or len(names) != 2:
             raise LightsError(f"--lights gpio:{place}: {FORM}")
-        self._chip = _path_of(chip)
+        chip = f"gpiochip{chip}" if chip.isdecimal() else chip
+        self._chip = chip if "/" in chip else f"/dev/{chip}"
         self._laser, self._led = Line.of(names[0]), Line.of(names[1])
         if self._laser.place == self._led.place:
             raise LightsError(f"--lights gpio:{place}: laser and LEDs on one line; {FORM}")
@@ -82,31 +83,24 @@ class GpioLights(Lights):
         if self._request is None:
             self._request = self._requested()
             self._reopened += 1
-        shines = lit in (Illumination.LASER, Illumination.LED)
-        if shines:
+        value, request = self._gpiod.line.Value, self._request
+        lights = {self._laser.place: Illumination.LASER, self._led.place: Illumination.LED}
+        wanted = {place: value.ACTIVE if lit is one else value.INACTIVE for place, one in lights.items()}
+        if lit in lights.values():
             self._notify_watchdog(LIT)
-        value = self._gpiod.line.Value
-        lights = (Illumination.LASER, Illumination.LED)
-        wanted = [value.ACTIVE if lit is light else value.INACTIVE for light in lights]
-        places, request = [self._laser.place, self._led.place], self._request
-        assert request is not None  # `_notify_watchdog` raises where it has lost it
         try:
-            request.set_values(dict(zip(places, wanted, strict=True)))
-            got = request.get_values(places)
+            request.set_values(wanted)
+            got = request.get_values(list(wanted))
         except OSError as error:
             self._lose()
             raise LightsError(f"{self._chip}: lost: {error.strerror or error}") from error
-        if got != wanted:
+        if got != list(wanted.values()):
             raise LightsError(
-                f"{self._chip}: lines {places[0]} and {places[1]} were set to {_levels(wanted)} and read"
-                f" {_levels(got)}: something else drives them, or they are shorted"
+                f"{self._chip}: lines {self._laser.place} and {self._led.place} were set to"
+                f" {_levels(wanted.values())} and read {_levels(got)}: something else drives them, or they are shorted"
             )
-        if not shines:
+        if lit not in lights.values():
             self._notify_watchdog(DARK)
-
-    def off(self) -> None:
-        """Set both lines dark."""
-        self.switch(Illumination.AMBIENT)
 
     def close(self) -> None:
         """Dark, and the lines given back."""
@@ -136,10 +130,10 @@ class GpioLights(Lights):
             ) from error
 
     def _lose(self) -> None:
-        request, self._request = self._request, None
+        request, watchdog = self._request, self._watchdog
+        self._request = self._watchdog = None
         if request is not None:
             request.release()
-        watchdog, self._watchdog = self._watchdog, None
         if watchdog is not None:
             try:
                 watchdog.communicate(timeout=WATCHDOG_S)  # ends its input, and waits: then the lines are free
@@ -204,13 +198,7 @@ class GpioLights(Lights):
         return ", ".join(found) or "somebody"
 
 
-def _path_of(chip: str) -> str:
-    if chip.isdecimal():
-        return f"/dev/gpiochip{chip}"
-    return chip if "/" in chip else f"/dev/{chip}"
-
-
-def _levels(values: Sequence[object]) -> str:
+def _levels(values: Iterable[object]) -> str:
     return " ".join(str(getattr(value, "name", value)).lower() for value in values)
 
 

@@ -14,6 +14,8 @@ or not dark, and currents out of range, raise `LightsError`.
 
 import fcntl
 from collections import Counter
+from collections.abc import Generator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 from smbus2 import SMBus
@@ -42,17 +44,8 @@ class Register(NamedTuple):
 REGISTER = Register()
 FLASH = {Illumination.LASER: 0x0D, Illumination.LED: 0x0E}  # 8.6.1: mode 11 (flash) with LED1, with LED2
 # 8.6.10, 8.6.11, from bit 0 on
-FAULTS1 = (
-    "timeout",
-    "undervoltage",
-    "overheated",
-    "current_limit",
-    "led_short",
-    "laser_short",
-    "out_short",
-    "tx",
-)
-FAULTS2 = ("led_hot", "overvoltage", "input_low", "ntc_open", "ntc_short")
+FAULTS1 = "timeout undervoltage overheated current_limit led_short laser_short out_short tx"
+FAULTS2 = "led_hot overvoltage input_low ntc_open ntc_short"
 
 
 class FlashDriverLights(Lights):
@@ -69,10 +62,10 @@ class FlashDriverLights(Lights):
                 f"--lights i2c:{place}: write i2c:BUS, or i2c:BUS:ADDRESS, for example i2c:1:0x63"
             ) from error
         self._where = f"I2C bus {self._number}, address 0x{self._address:02x}"
-        self._codes = (
-            current_code(strobe.laser.current_a, "laser"),
-            current_code(strobe.led.current_a, "led"),
-        )
+        self._codes = [
+            current_code(light.current_a, name)
+            for name, light in (("laser", strobe.laser), ("led", strobe.led))
+        ]
         self._bus: SMBus | None = None
         self._ready = self._closed = False
         self._counts: Counter[str] = Counter({"reopened": 0})
@@ -80,20 +73,18 @@ class FlashDriverLights(Lights):
 
     def switch(self, lit: Illumination) -> None:
         """Begin a flash, or end it; a chip that was away is set up again first."""
-        if lit not in FLASH:
-            self.off()
-            return
         if self._closed:
+            return
+        if lit not in FLASH:
+            self._standby()
             return
         if not self._ready:
             self._set_up()
             self._counts["reopened"] += 1
         self._write(REGISTER.enable, FLASH[lit])
 
-    def off(self) -> None:
-        """Standby, read back; then the flags."""
-        if self._closed:
-            return
+    def _standby(self) -> None:
+        """Have both off, read back; then the flags."""
         self._write(REGISTER.enable, REGISTER.standby)
         is_on = 0x0F  # 8.6.1: mode and LED bits
         if (got := self._read(REGISTER.enable)) & is_on:
@@ -120,11 +111,8 @@ class FlashDriverLights(Lights):
         id_mask, lm3644 = 0x3F, 0x02  # 8.6.12
         kind = self._read(REGISTER.device_id) & id_mask
         if kind != lm3644:
-            what = (
-                "an LM3644TT, whose shortest time-out is 40 ms"
-                if kind == REGISTER.lm3644tt
-                else f"id 0x{kind:02x}"
-            )
+            slower = "an LM3644TT, whose shortest time-out is 40 ms"
+            what = slower if kind == REGISTER.lm3644tt else f"id 0x{kind:02x}"
             raise LightsError(f"{self._where}: is {what}; an LM3644 (id 0x{lm3644:02x}) is needed")
         laser, led = self._codes  # bit 7 of LED1's register clear: LED2 has a current of its own (8.6.3)
         timeout_10_ms = 0x10  # 8.6.8: bits 3-0 0000: 10 ms; bits 6-4, the torch's ramp, as after a reset
@@ -147,38 +135,36 @@ class FlashDriverLights(Lights):
     def _count_faults(self) -> None:
         for register, names in ((REGISTER.flags1, FAULTS1), (REGISTER.flags2, FAULTS2)):
             flags = self._read(register)
-            self._counts.update(f"fault.{name}" for bit, name in enumerate(names) if flags >> bit & 1)
+            self._counts.update(f"fault.{name}" for bit, name in enumerate(names.split()) if flags >> bit & 1)
 
     def _write(self, register: int, value: int) -> None:
-        try:
-            self._opened_bus().write_byte_data(self._address, register, value)
-        except OSError as error:
-            raise self._lost(error) from error
+        with self._opened() as bus:
+            bus.write_byte_data(self._address, register, value)
 
     def _read(self, register: int) -> int:
-        try:
-            return int(self._opened_bus().read_byte_data(self._address, register))
-        except OSError as error:
-            raise self._lost(error) from error
+        with self._opened() as bus:
+            return int(bus.read_byte_data(self._address, register))
 
-    def _opened_bus(self) -> SMBus:
+    @contextmanager
+    def _opened(self) -> Generator[SMBus]:
+        """The bus; after an error, maybe of an unplugged adapter, opened again next time."""
         if self._bus is None:
-            self._bus = self._opened()
-        return self._bus
-
-    def _lost(self, error: OSError) -> LightsError:
-        """The error; the bus, maybe of an unplugged adapter, is opened again next time."""
-        self._drop()
-        return LightsError(
-            f"{self._where}: no answer ({error.strerror or error}); `i2cdetect -y {self._number}` shows who answers"
-        )
+            self._bus = self._locked()
+        try:
+            yield self._bus
+        except OSError as error:
+            self._drop()
+            raise LightsError(
+                f"{self._where}: no answer ({error.strerror or error}); `i2cdetect -y {self._number}` shows who"
+                " answers"
+            ) from error
 
     def _drop(self) -> None:
         bus, self._bus, self._ready = self._bus, None, False
         if bus is not None:
             bus.close()
 
-    def _opened(self) -> SMBus:
+    def _locked(self) -> SMBus:
         """The open bus, locked: each program of lights keeps the limits for itself alone."""
         try:
             bus = SMBus(self._number)

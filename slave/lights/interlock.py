@@ -20,7 +20,6 @@ from common.errors import LightsError
 from common.recording.frame_recording import Illumination
 
 WINDOW_NS = 1_000_000_000  # over which the duty is reckoned; any second, not every second
-EVENTS = ("pulses", "refused", "off_by_watchdog", "failed")
 _SHINING = (Illumination.LASER, Illumination.LED)
 _LOG = logging.getLogger(__name__)
 
@@ -38,9 +37,9 @@ class Lights(ABC):
             LightsError: The device is gone, or did not do it. What it does then, nobody knows: `off` is tried next.
         """
 
-    @abstractmethod
     def off(self) -> None:
         """Have nothing on, now. As `switch`."""
+        self.switch(Illumination.AMBIENT)
 
     @abstractmethod
     def close(self) -> None:
@@ -58,11 +57,7 @@ class Interlock:
     """
 
     def __init__(
-        self,
-        lights: Lights,
-        strobe: StrobeCalibration,
-        clock: Clock | None = None,
-        watch: bool = True,
+        self, lights: Lights, strobe: StrobeCalibration, clock: Clock | None = None, watch: bool = True
     ) -> None:
         """Take the driver over, dark; start the watchdog: without, call `look`."""
         self._lights = lights
@@ -74,11 +69,10 @@ class Interlock:
         self._on: Illumination | None = None
         self._since_ns = self._until_ns = 0
         self._closed = self._failing = False
-        self.counts: Counter[str] = Counter(dict.fromkeys(EVENTS, 0))
+        self.counts = Counter({"pulses": 0, "refused": 0, "off_by_watchdog": 0, "failed": 0})
         atexit.register(lights.close)  # where an exception ends the process and nobody closes
-        self._thread: threading.Thread | None = None
+        self._thread = threading.Thread(target=self._watch, name="light watchdog", daemon=True)
         if watch:
-            self._thread = threading.Thread(target=self._watch, name="light watchdog", daemon=True)
             self._thread.start()
 
     def begin(self, lit: Illumination, length_ns: int) -> bool:
@@ -133,7 +127,7 @@ class Interlock:
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        if self._thread is not None:
+        if self._thread.ident is not None:  # it was started
             self._thread.join()
         self._lights.close()
         atexit.unregister(self._lights.close)
@@ -146,9 +140,7 @@ class Interlock:
         """Send an order; whatever it raises is a failure, after which a light may be on."""
         try:
             order()
-        except (
-            Exception
-        ) as error:  # also what a library below it raises: no thread that darkens may end by it
+        except Exception as error:  # also of a library below: no thread that darkens may end by it
             self.counts["failed"] += 1
             self._failing = True
             self._changed.notify_all()

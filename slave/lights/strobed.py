@@ -6,7 +6,6 @@ it asked for; a thread would be as late as the drawing makes it, which no real d
 cannot be lit so raises `CalibrationError`; in a running camera `CameraError`.
 """
 
-import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -140,46 +139,27 @@ class Lit:
         return Illumination.LASER if self.laser >= self.led else Illumination.LED
 
 
-class Timeline:
-    """What was on when; written by the lights, read by the camera, of any threads."""
+class SyntheticLights(Lights):
+    """`Lights` that only record what was on when, by `clock`; read from any thread."""
 
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
+    def __init__(self, clock: Clock) -> None:
+        self._clock, self._closed = clock, False
         # Four switchings per cycle of the strobe, so some seconds
         self._switched: deque[tuple[int, Illumination]] = deque(maxlen=512)
-
-    def add(self, t_ns: int, lit: Illumination) -> None:
-        """From `t_ns` on this is on; times rise."""
-        with self._lock:
-            self._switched.append((t_ns, lit))
-
-    def during(self, start_ns: int, stop_ns: int) -> Lit:
-        """What was on from `start_ns` to `stop_ns`, which is later [ns]."""
-        with self._lock:
-            switched = list(self._switched)
-        on_ns = {Illumination.LASER: 0, Illumination.LED: 0}
-        for (t_ns, lit), (end_ns, _) in pairwise([*switched, (stop_ns, Illumination.AMBIENT)]):
-            if lit in on_ns:
-                on_ns[lit] += max(min(end_ns, stop_ns) - max(t_ns, start_ns), 0)
-        whole_ns = stop_ns - start_ns
-        return Lit(on_ns[Illumination.LASER] / whole_ns, on_ns[Illumination.LED] / whole_ns)
-
-
-class SyntheticLights(Lights):
-    """`Lights` that only take note on a timeline, at the times of `clock`."""
-
-    def __init__(self, timeline: Timeline, clock: Clock) -> None:
-        self._timeline, self._clock = timeline, clock
-        self._closed = False
 
     def switch(self, lit: Illumination) -> None:
         """Have it on from now on."""
         if not self._closed:
-            self._timeline.add(self._clock.now_ns(), lit)
+            self._switched.append((self._clock.now_ns(), lit))
 
-    def off(self) -> None:
-        """Have nothing on from now on."""
-        self.switch(Illumination.AMBIENT)
+    def during(self, start_ns: int, stop_ns: int) -> Lit:
+        """What was on from `start_ns` to `stop_ns`, which is later [ns]."""
+        on_ns = {Illumination.LASER: 0, Illumination.LED: 0}
+        for (t_ns, lit), (end_ns, _) in pairwise([*tuple(self._switched), (stop_ns, Illumination.AMBIENT)]):
+            if lit in on_ns:
+                on_ns[lit] += max(min(end_ns, stop_ns) - max(t_ns, start_ns), 0)
+        whole_ns = stop_ns - start_ns
+        return Lit(on_ns[Illumination.LASER] / whole_ns, on_ns[Illumination.LED] / whole_ns)
 
     def close(self) -> None:
         """Go dark for good."""
@@ -205,10 +185,11 @@ class SimulatedStrobe(Strobe):
     def __init__(
         self, schedule: StrobeSchedule, strobe: StrobeCalibration, late_ns: Callable[[], int] = lambda: 0
     ) -> None:
-        """Begin dark; `late_ns`: how much later than asked for the strober comes [ns]."""
-        self._late_ns, self._set_clock, self._timeline = late_ns, _SetClock(), Timeline()
-        lights = SyntheticLights(self._timeline, self._set_clock)
-        super().__init__(schedule, Interlock(lights, strobe, self._set_clock, watch=False), self._set_clock)
+        """Begin dark; `late_ns`: how much later than asked for the strobe comes [ns]."""
+        self._late_ns, self._set_clock = late_ns, _SetClock()
+        self._lights = SyntheticLights(self._set_clock)
+        interlock = Interlock(self._lights, strobe, self._set_clock, watch=False)
+        super().__init__(schedule, interlock, self._set_clock)
         self._again_ns: int | None = None
 
     def during(self, start_ns: int, stop_ns: int) -> Lit:
@@ -219,7 +200,7 @@ class SimulatedStrobe(Strobe):
             self._ask()
         self._monitored(stop_ns)
         self._set_clock.t_ns = max(stop_ns, self._set_clock.t_ns)
-        return self._timeline.during(start_ns, stop_ns)
+        return self._lights.during(start_ns, stop_ns)
 
     def push(self, seq: int, t_ns: int) -> None:
         """As of `Strobe`."""
@@ -233,7 +214,7 @@ class SimulatedStrobe(Strobe):
         self._again_ns = None
 
     def _ask(self) -> None:
-        again_ns = self._strober.step()
+        again_ns = self.step()
         self._again_ns = None if again_ns is None else again_ns + self._late_ns()
 
     def _monitored(self, until_ns: int) -> None:

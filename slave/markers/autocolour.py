@@ -24,18 +24,19 @@ from common.calibration import HandProfile, HsvRange
 from common.errors import CalibrationError, FitError
 from common.hand.model import HandModel
 from slave.markers.autocolour_things import (
-    SETTINGS,
+    RESTING_SKIN,
+    SKIN_AROUND,
     Surroundings,
     Thing,
     background_of,
     coloured,
-    hsv_of,
+    least_shift_px,
     skin_of,
     spread,
     surroundings_of,
     things_of,
 )
-from slave.markers.classify import HUES
+from slave.markers.classify import HUES, hue_distance, hue_span
 from slave.markers.colours import (
     AROUND,
     HUE_GROW,
@@ -44,13 +45,13 @@ from slave.markers.colours import (
     RIM,
     ColourRow,
     circular_median,
-    hue_distance,
-    hue_separation,
+    dilated,
+    hsv_of,
+    like,
     rows_of,
 )
 
 FRAMES_LEAST = 8
-UNUSUAL = 0.55, 0.4  # of a thing's median saturation and value; below is rim or highlight, not marker colour
 
 Notify = Callable[[str], None]
 Namer = Callable[[Sequence["MarkerColour"], Float], tuple[str, ...]]
@@ -78,9 +79,8 @@ class MarkerColour:
     def moved(self) -> bool:
         """Whether it went farther than noise and partial cover could shift it."""
         size = float(np.median([thing.size for thing in self.things]))
-        place = np.array([(thing.u, thing.v) for thing in self.things])
-        low, high = np.percentile(place, (5, 95), axis=0)
-        return float(np.hypot(*(high - low))) > SETTINGS.shift_px + SETTINGS.shift_share * size
+        low, high = np.percentile([(thing.u, thing.v) for thing in self.things], (5, 95), axis=0)
+        return float(np.hypot(*(high - low))) > least_shift_px(size)
 
 
 def calibrate_moving(
@@ -132,19 +132,15 @@ def find_colours(things: Sequence[Sequence[Thing]], count: int, around: Surround
     seen_least = 4  # and at least so many
     least = max(seen_least, seen_share * frames)
     every = [colour for colour in _by_hue(things) if len(colour.things) >= least]
-    near_skin = [colour for colour in every if colour.skin >= SETTINGS.skin_around]
+    near_skin = [colour for colour in every if colour.skin >= SKIN_AROUND]
     typical = float(np.median([colour.area for colour in near_skin])) if near_skin else 0.0
     size_share = 0.25  # of the typical area of all; a smaller thing is the fringe of another
     near_skin = [colour for colour in near_skin if colour.area >= size_share * typical]
     moving = [colour for colour in near_skin if colour.moved]
     # A colour that rested all the time looks like clutter but for the skin around it. It is taken when it is needed.
-    resting = [
-        colour
-        for colour in near_skin
-        if not colour.moved and colour.skin >= SETTINGS.resting_skin and not around.wooden
-    ]
+    resting = [colour for colour in near_skin if colour not in moving and colour.skin >= RESTING_SKIN]
     found = sorted(moving, key=lambda colour: -len(colour.things))
-    if len(found) < count:
+    if len(found) < count and not around.wooden:
         found += sorted(resting, key=lambda colour: -len(colour.things))
     hues = ", ".join(f"{colour.hue:.0f}" for colour in sorted(found, key=lambda colour: colour.hue)) or "none"
     if len(found) < count:
@@ -175,13 +171,7 @@ def places(colours: Sequence[MarkerColour], frames: int) -> Float:
 
 def pixels_of(colour: MarkerColour) -> Image:
     """Return a colour's pixels (N, 3) HSV in all frames, less rims and highlights."""
-    chosen: list[Image] = []
-    for thing in colour.things:
-        saturation, value = np.median(thing.hsv[:, 1]), np.median(thing.hsv[:, 2])
-        pure = hue_distance(thing.hsv[:, 0], colour.hue) <= HUE_GROW
-        pure &= (thing.hsv[:, 1] >= UNUSUAL[0] * saturation) & (thing.hsv[:, 2] >= UNUSUAL[1] * value)
-        chosen.append(thing.hsv[pure])
-    return np.concatenate(chosen)
+    return np.concatenate([thing.hsv[like(thing.hsv, colour.hue, thing.hsv)] for thing in colour.things])
 
 
 def _by_hue(things: Sequence[Sequence[Thing]]) -> list[MarkerColour]:
@@ -200,19 +190,15 @@ def _by_hue(things: Sequence[Sequence[Thing]]) -> list[MarkerColour]:
     for k in np.argsort(-density, kind="stable"):
         if density[k] < 1.0:
             break
-        if all(hue_separation(k, p) >= HUE_SEPARATION for p in peaks):
+        if all(hue_distance(k, p) >= HUE_SEPARATION for p in peaks):
             peaks.append(int(k))
     peaks = [p for p in peaks if density[p] >= max(density[p - 1], density[(p + 1) % HUES])]
     nearest = np.argmin([hue_distance(hue, p) for p in peaks], axis=0)
     colours: list[MarkerColour] = []
     for n, peak in enumerate(peaks):
-        mine = [
-            thing
-            for thing, k in zip(flat, nearest, strict=True)
-            if k == n and hue_separation(thing.hue, peak) <= HUE_GROW
-        ]
         best: dict[int, Thing] = {}
-        for thing in mine:
+        for k in np.flatnonzero((nearest == n) & (hue_distance(hue, peak) <= HUE_GROW)):
+            thing = flat[k]
             if thing.frame not in best or thing.area > best[thing.frame].area:
                 best[thing.frame] = thing
         if best:
@@ -222,19 +208,18 @@ def _by_hue(things: Sequence[Sequence[Thing]]) -> list[MarkerColour]:
 
 
 def _refuse_ambiguous(things: Sequence[Sequence[Thing]], colours: Sequence[MarkerColour]) -> None:
+    # a second thing this large, in this share of the frames: two marker colours of one hue
+    ambiguous_size, ambiguous_share = 0.3, 0.4
     for colour in colours:
-        double = 0
-        # a second thing this large, in this share of the frames: two marker colours of one hue
-        ambiguous_size, ambiguous_share = 0.3, 0.4
-        for largest in colour.things:
-            others = [
-                t
-                for t in things[largest.frame]
-                if t is not largest
-                and t.area > ambiguous_size * largest.area
-                and hue_separation(t.hue, colour.hue) < HUE_SEPARATION
-            ]
-            double += bool(others)
+        double = sum(
+            any(
+                other is not largest
+                and other.area > ambiguous_size * largest.area
+                and hue_distance(other.hue, colour.hue) < HUE_SEPARATION
+                for other in things[largest.frame]
+            )
+            for largest in colour.things
+        )
         if double > ambiguous_share * len(colour.things):
             raise FitError(
                 f"two things of hue {colour.hue:.0f} move with the hand in {double} of {len(colour.things)} frames: "
@@ -245,9 +230,9 @@ def _refuse_ambiguous(things: Sequence[Sequence[Thing]], colours: Sequence[Marke
 def _why_fewer(every: Sequence[MarkerColour], around: Surroundings) -> str:
     """Describe, for the error message, what else might have been a marker colour."""
     reasons = ""
-    if bare := [f"{colour.hue:.0f}" for colour in every if colour.skin < SETTINGS.skin_around]:
+    if bare := [f"{colour.hue:.0f}" for colour in every if colour.skin < SKIN_AROUND]:
         reasons += f"; hue {', '.join(bare)} has no skin beside it"
-    if still := [f"{thing.hue:.0f}" for thing in around.clutter if thing.skin >= SETTINGS.skin_around]:
+    if still := [f"{thing.hue:.0f}" for thing in around.clutter if thing.skin >= SKIN_AROUND]:
         reasons += f"; what is coloured beside skin with hue {', '.join(still)} never moved"
     desk = np.flatnonzero((around.floor > PALE) & (around.floor < 256.0))
     if len(desk):
@@ -273,14 +258,12 @@ def _others(
         hsv = hsv_of(images[k])
         colour = np.zeros(hsv.shape[:2], np.uint8)
         for thing in things[k]:
-            if any(hue_separation(thing.hue, p.hue) <= HUE_GROW for p in colours):
+            if any(hue_distance(thing.hue, p.hue) <= HUE_GROW for p in colours):
                 colour.reshape(-1)[thing.pixels] = 1
         colour |= _scraps(hsv, around, largest)
-        rim, near = (
-            cv2.dilate(colour, np.ones((2 * r + 1, 2 * r + 1), np.uint8)) != 0 for r in (RIM, AROUND)
-        )
-        skins.append(hsv[near & ~rim & around.skin.mask(hsv)])
-        grounds.append(hsv[~np.asarray(rim)])
+        rim = dilated(colour, RIM)
+        skins.append(hsv[dilated(colour, AROUND) & ~rim & around.skin.mask(hsv)])
+        grounds.append(hsv[~rim])
     return np.concatenate(skins), np.concatenate(grounds), len(chosen)
 
 
@@ -290,10 +273,9 @@ def _scraps(hsv: Image, around: Surroundings, largest: int) -> Image:
         coloured(hsv, around).astype(np.uint8), connectivity=8
     )
     skin = cv2.morphologyEx(around.skin.mask(hsv).astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
-    near_skin = np.asarray(cv2.dilate(skin, np.ones((5, 5), np.uint8)) != 0)
     for thing in around.clutter:
         labels.reshape(-1)[thing.pixels] = 0
-    touching = np.bincount(labels[near_skin], minlength=len(stats)) > 0
+    touching = np.bincount(labels[dilated(np.asarray(skin, np.uint8), 2)], minlength=len(stats)) > 0
     touching &= stats[:, cv2.CC_STAT_AREA] <= largest
     touching[0] = False
     return touching[np.asarray(labels, np.int64)].astype(np.uint8)
@@ -404,7 +386,7 @@ def by_hues(
         raise CalibrationError(
             f"{where}: markers: no range for {', '.join(missing)}: no names can be taken from it"
         )
-    middle = {name: _middle(markers[name]) for name in names}
+    middle = {name: hue_span(markers[name])[0] for name in names}
     around = sorted(names, key=lambda name: middle[name])
 
     def name(colours: Sequence[MarkerColour], uv: Float) -> tuple[str, ...]:
@@ -476,8 +458,3 @@ def by_clicks(clicks: Mapping[str, tuple[float, float]], names: tuple[str, ...],
         return tuple(of[k] for k in range(len(colours)))
 
     return name
-
-
-def _middle(colour: HsvRange) -> float:
-    low, high = colour.hsv_low[0], colour.hsv_high[0]
-    return (low + ((high - low) % HUES) / 2.0) % HUES

@@ -10,21 +10,19 @@ clutter      things of the background that stay whole in one place while the han
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, cast
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from common.arrays import Bool, Float, Image, Int
 from common.errors import FitError
-from slave.markers.classify import HUES
-from slave.markers.colours import HUE_GROW, PALE, SMALLEST, circular_median, hue_distance, hue_separation
+from slave.markers.classify import HUES, hue_distance
+from slave.markers.colours import HUE_GROW, PALE, SMALLEST, circular_median, dilated, hsv_of, like
 
 SKIN_VALUE = 60
 SKIN_HALF_WIDTH = 12  # in hue; nearer than this no marker colour can be distinguished from skin
-DARK = 40  # value below which hue is noise
 RING = 2, 5  # px: skin is sought outside the mixed pixels of the rim, and near
+DARK = 40  # value below which hue is noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,19 +101,14 @@ def coloured(hsv: Image, around: Surroundings) -> Bool:
 
 def hides(thing: Thing, clutter: Thing) -> bool:
     """Whether `thing` is the clutter, or a part of it."""
-    if hue_separation(thing.hue, clutter.hue) > HUE_GROW:
+    if hue_distance(thing.hue, clutter.hue) > HUE_GROW:
         return False
     inside = np.isin(thing.pixels, clutter.pixels, assume_unique=True)
     covered = 0.3  # share of a thing that lies on clutter of its hue: it is that clutter, or hidden before it
     return float(inside.mean()) > covered
 
 
-def hsv_of(image: Image) -> Image:
-    """OpenCV HSV of a BGR image."""
-    return cast(Image, cv2.cvtColor(image, cv2.COLOR_BGR2HSV))
-
-
-def _cut_by_hue(hue: npt.NDArray[np.uint8], piece: Bool) -> list[Bool]:
+def _cut_by_hue(hue: Image, piece: Bool) -> list[Bool]:
     """Split a piece into connected parts of one hue each, the most frequent first."""
     parts: list[Bool] = []
     rest = piece.copy()
@@ -144,40 +137,35 @@ def _thing(hsv: Image, skin: Bool, part: Bool, corner: tuple[int, int], frame: i
     bottom, right = min(int(y.max()) + RING[1] + 1, height), min(int(x.max()) + RING[1] + 1, width)
     own = np.zeros((bottom - top, right - left), np.uint8)
     own[y - top, x - left] = 1
-    inner, outer = (cv2.dilate(own, np.ones((2 * r + 1, 2 * r + 1), np.uint8)) for r in RING)
-    ring = np.asarray(outer != inner)
+    ring = _ring(own)
     share = float(skin[top:bottom, left:right][ring].mean()) if ring.any() else 0.0
     colours = hsv[y, x]
     hue = circular_median(colours[:, 0])
     return Thing(frame, float(x.mean()), float(y.mean()), hue, y * width + x, colours, share)
 
 
-class SurroundingsSettings(NamedTuple):
-    """Numbers that part a painted hand from its surroundings."""
-
-    median_frames: int = 25  # enough for a median; more only cost memory
-    different: int = 25  # grey levels that no noise reaches, in any channel
-    tiles: int = 8  # the image in so many rows and columns:
-    # a thing that went farther, plus this share of its size, has moved
-    shift_px: float = 2.0
-    shift_share: float = 0.05
-    whole: float = 0.95  # of the area: a thing half covered shifts its centroid, but gets smaller
-    moved_frames: int = 3
-    # share of skin around a marker colour in a typical frame; painted caps have 0.12 and more
-    skin_around: float = 0.08
-    resting_skin: float = (
-        0.5  # share of skin around a thing that never moved, from which it is painted on the hand
-    )
+def _ring(thing: Image) -> Bool:
+    """What lies just around a mask (H, W) of 0 and 1."""
+    return dilated(thing, RING[1]) & ~dilated(thing, RING[0])
 
 
-SETTINGS = SurroundingsSettings()
+def least_shift_px(size: float) -> float:
+    """How far a thing of this size [px] goes at least if it has moved."""
+    return 2.0 + 0.05 * size
+
+
+MEDIAN_FRAMES = 25  # enough for a median; more only cost memory
+DIFFERENT = 25  # grey levels that no noise reaches, in any channel
+MOVED_FRAMES = 3
+SKIN_AROUND = 0.08  # share of skin around a marker colour in a typical frame; painted caps have 0.12 and more
+RESTING_SKIN = 0.5  # share of skin around a thing that never moved, from which it is painted on the hand
 SKIN_HUES = 165, 30  # from magenta-red to yellow: skin of every tone under every lamp, wrapping through 0
 SKIN_SATURATION = 30, 210
 
 
 def background_of(images: Sequence[Image]) -> Image:
-    """Median over at most `median_frames` frames, evenly taken; (H, W, 3)."""
-    chosen = [images[k] for k in spread(len(images), SETTINGS.median_frames)]
+    """Median over some of the frames, evenly taken; (H, W, 3)."""
+    chosen = [images[k] for k in spread(len(images), MEDIAN_FRAMES)]
     rows = [np.median([image[v] for image in chosen], axis=0) for v in range(chosen[0].shape[0])]
     return np.stack(rows).astype(np.uint8)
 
@@ -191,9 +179,9 @@ def skin_of(images: Sequence[Image], background: Image) -> Skin:
     """Skin: what moves and has a skin's hue; FitError: nothing moves, or no skin."""
     samples: list[Image] = []
     moving = 0.0
-    chosen = spread(len(images), SETTINGS.median_frames)
+    chosen = spread(len(images), MEDIAN_FRAMES)
     for k in chosen:
-        differs = np.asarray(cv2.absdiff(images[k], background)).max(axis=2) > SETTINGS.different
+        differs = np.asarray(cv2.absdiff(images[k], background)).max(axis=2) > DIFFERENT
         moving += float(differs.mean()) / len(chosen)
         hsv = hsv_of(images[k])[differs]
         hue, saturation = hsv[:, 0], hsv[:, 1]
@@ -220,15 +208,13 @@ def surroundings_of(images: Sequence[Image], background: Image, skin: Skin) -> S
     # share of the background that has the colour of skin, from which skin proves nothing: wood
     skin_desk = 0.2
     wooden = float(skin.mask(hsv_of(background)).mean()) > skin_desk
-    clutter: list[Thing] = []
-    for thing in standing:
-        if _moved(thing, images):
-            continue
-        resting = thing.skin >= SETTINGS.resting_skin or (
-            thing.skin >= SETTINGS.skin_around and _uncovered(thing, images, background, skin)
+
+    def resting(thing: Thing) -> bool:
+        return thing.skin >= RESTING_SKIN or (
+            thing.skin >= SKIN_AROUND and _uncovered(thing, images, background, skin)
         )
-        if wooden or not resting:
-            clutter.append(thing)
+
+    clutter = [thing for thing in standing if not _moved(thing, images) and (wooden or not resting(thing))]
     return Surroundings(skin, empty.floor, tuple(clutter), wooden)
 
 
@@ -236,14 +222,14 @@ def _floor(images: Sequence[Image], background: Image, skin: Skin) -> Float:
     """Return the saturation (180,) above which a pixel of that hue is coloured."""
     height, width = background.shape[:2]
     samples: list[Image] = []
-    tiles = np.zeros((HUES, SETTINGS.tiles * SETTINGS.tiles))
-    row: Int = np.arange(height, dtype=np.int64) * SETTINGS.tiles // height
-    column: Int = np.arange(width, dtype=np.int64) * SETTINGS.tiles // width
-    tile: Int = row[:, None] * SETTINGS.tiles + column
+    side = 8  # tiles in a row and in a column of the image
+    tiles = np.zeros((HUES, side * side))
+    rows, columns = np.arange(height, dtype=np.int64)[:, None], np.arange(width, dtype=np.int64)
+    tile = rows * side // height * side + columns * side // width
     desk_frames = 3  # from which the saturation of the desk is measured, noise included
     for k in spread(len(images), desk_frames):
         hsv = hsv_of(images[k])
-        desk = np.asarray(cv2.absdiff(images[k], background)).max(axis=2) <= SETTINGS.different
+        desk = np.asarray(cv2.absdiff(images[k], background)).max(axis=2) <= DIFFERENT
         desk &= (hsv[..., 1] >= PALE) & (hsv[..., 2] >= DARK)
         samples.append(hsv[desk])
         desk_tile = 100.0  # where one pixel in so many has it
@@ -257,7 +243,7 @@ def _floor(images: Sequence[Image], background: Image, skin: Skin) -> Float:
         ]
     )
     desk_share = 0.2  # a hue that is seen in this share of the tiles is the desk's, not a thing's,
-    everywhere = (around >= height * width / SETTINGS.tiles**2).mean(axis=1) >= desk_share
+    everywhere = (around >= height * width / side**2).mean(axis=1) >= desk_share
     floor = np.full(HUES, float(PALE))
     pixels = np.concatenate(samples)
     for hue in np.flatnonzero(everywhere):
@@ -277,12 +263,9 @@ def _moved(thing: Thing, images: Sequence[Image]) -> bool:
     left, right = max(int(columns.min()) - reach, 0), min(int(columns.max()) + reach + 1, width)
     place = np.zeros((bottom - top, right - left), np.bool_)
     place[rows - top, columns - left] = True
-    saturation, value = np.median(thing.hsv[:, 1]), np.median(thing.hsv[:, 2])
     seen: list[tuple[float, float, float]] = []  # area and centroid of what touches its place, per frame
     for image in images:
-        hsv = hsv_of(image[top:bottom, left:right])
-        same = hue_distance(hsv[..., 0], thing.hue) <= HUE_GROW
-        same &= (hsv[..., 1] >= 0.55 * saturation) & (hsv[..., 2] >= 0.4 * value)
+        same = like(hsv_of(image[top:bottom, left:right]), thing.hue, thing.hsv)
         count, labels, stats, centres = cv2.connectedComponentsWithStats(
             same.astype(np.uint8), connectivity=4
         )
@@ -291,15 +274,13 @@ def _moved(thing: Thing, images: Sequence[Image]) -> bool:
         best = int(np.argmax(overlap))
         if overlap[best]:
             seen.append((float(stats[best, cv2.CC_STAT_AREA]), *centres[best].tolist()))
-    if len(seen) < SETTINGS.moved_frames:
+    if len(seen) < MOVED_FRAMES:
         return False
     area, u, v = np.array(seen).T
-    whole = (area >= SETTINGS.whole * np.median(area)) & (area <= np.median(area) / SETTINGS.whole)
-    shift = np.hypot(u - np.median(u), v - np.median(v))
-    return (
-        int((whole & (shift > SETTINGS.shift_px + SETTINGS.shift_share * thing.size)).sum())
-        >= SETTINGS.moved_frames
-    )
+    whole = 0.95  # of the area: a thing half covered shifts its centroid, but gets smaller
+    moved = (area >= whole * np.median(area)) & (area <= np.median(area) / whole)
+    moved &= np.hypot(u - np.median(u), v - np.median(v)) > least_shift_px(thing.size)
+    return int(moved.sum()) >= MOVED_FRAMES
 
 
 def _uncovered(thing: Thing, images: Sequence[Image], background: Image, skin: Skin) -> bool:
@@ -307,16 +288,10 @@ def _uncovered(thing: Thing, images: Sequence[Image], background: Image, skin: S
     height, width = background.shape[:2]
     place = np.zeros(height * width, np.uint8)
     place[thing.pixels] = 1
-    inner, outer = (
-        cv2.dilate(place.reshape(height, width), np.ones((2 * r + 1, 2 * r + 1), np.uint8)) for r in RING
-    )
-    ring = background[np.asarray(outer != inner)]
+    ring = background[_ring(place.reshape(height, width))]
     desk = ring[~skin.mask(hsv_of(ring[None]))[0]]
     if len(desk) == 0:
         return False
     colour = np.median(desk, axis=0)
-    bare = 0
-    for image in images:
-        away = np.abs(image.reshape(-1, 3)[thing.pixels] - colour).max(axis=1) <= SETTINGS.different
-        bare += bool(away.mean() > 0.5)
-    return bare >= SETTINGS.moved_frames
+    seen = (np.abs(image.reshape(-1, 3)[thing.pixels] - colour).max(axis=1) for image in images)
+    return sum(bool((away <= DIFFERENT).mean() > 0.5) for away in seen) >= MOVED_FRAMES

@@ -20,17 +20,14 @@ double precision.
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple, TypeAlias, cast
+from typing import NamedTuple, cast
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from common.arrays import Bool, Float, Image
+from common.arrays import Bool, Float, Float32, Image
 from common.geometry.srgb import to_linear
 from slave.markers.classify import SCALE, Blob, ColourTable
-
-Float32: TypeAlias = npt.NDArray[np.float32]
 
 WHITE = 4095  # light of a full byte
 # Added to the scatter: one grey level of noise, so that a flat colour stays solvable.
@@ -164,15 +161,13 @@ def measure(
         return []
     sides = [max(b.right - b.left, b.bottom - b.top) + 2 * PAD for b in blobs]
     unequal = 3.0  # largest to smallest window of one stack: beyond it, padding costs more than another stack
-    if max(sides) <= unequal * min(sides):
+    limit = unequal * min(sides)
+    if max(sides) <= limit:
         return _measure_stack(image, table, bits, blobs, alone)
+    # Those of like size together, then the larger ones in the same way.
     found: list[Measured | None] = [None] * len(blobs)
-    order = sorted(range(len(blobs)), key=sides.__getitem__)
-    while order:
-        limit = unequal * sides[order[0]]
-        group = [i for i in order if sides[i] <= limit]
-        order = order[len(group) :]
-        results = _measure_stack(
+    for group in [[i for i, s in enumerate(sides) if (s <= limit) is small] for small in (True, False)]:
+        results = measure(
             image, table, [bits[i] for i in group], [blobs[i] for i in group], [alone[i] for i in group]
         )
         for i, result in zip(group, results, strict=True):
@@ -242,21 +237,11 @@ def _measure_stack(
     centre = moments[:, 1:3]
     spread = moments[:, 3:] - centre[:, FIRST] * centre[:, SECOND]
     centre += grid.middle
-    colour = mean / WHITE
     windows = share.reshape(count, height, width)
     found: list[Measured | None] = []
-    rows = zip(
-        centre.tolist(),
-        area.tolist(),
-        contrast.tolist(),
-        thin.tolist(),
-        colour.tolist(),
-        spread.tolist(),
-        strict=True,
-    )
-    for i, (b, ((u, v), area, contrast, sliver, bgr, (xx, xy, yy))) in enumerate(
-        zip(blobs, rows, strict=True)
-    ):
+    rows = zip(*(x.tolist() for x in (centre, area, contrast, thin, mean / WHITE, spread)), strict=True)
+    for i, (b, row) in enumerate(zip(blobs, rows, strict=True)):
+        (u, v), area, contrast, sliver, bgr, (xx, xy, yy) = row
         foreign = 0.0
         if sliver:
             if np.count_nonzero(own[i]) < MIN_PIXELS or area < 1.0:
@@ -294,10 +279,9 @@ def _only_the_blob(own: Bool, blobs: Sequence[Blob], alone: Sequence[bool]) -> N
     for tile, b, lonely in zip(own, blobs, alone, strict=True):
         if lonely:
             continue
-        parts = cast(
+        count, labels = cast(
             tuple[int, Image], cv2.connectedComponents(tile.view(np.uint8), connectivity=8, ltype=cv2.CV_16U)
         )
-        count, labels = parts
         # The blob's points of the grid lie inside its box by the width of the grid.
         rows = slice(PAD + SCALE - 1, max(PAD + b.bottom - b.top - SCALE + 1, PAD + SCALE))
         columns = slice(PAD + SCALE - 1, max(PAD + b.right - b.left - SCALE + 1, PAD + SCALE))
@@ -325,13 +309,6 @@ def _eroded(own: Bool, width: int) -> Bool:
 def _is_cut(own: Bool, b: Blob, size: tuple[int, ...]) -> bool:
     if b.left > 0 and b.top > 0 and b.right < size[1] and b.bottom < size[0]:
         return False
-    rows, columns = np.flatnonzero(own.any(axis=1)), np.flatnonzero(own.any(axis=0))
-    if rows.size == 0:
-        return False
-    left, top = b.left - PAD, b.top - PAD
-    return bool(
-        rows[0] + top <= 0
-        or columns[0] + left <= 0
-        or rows[-1] + top >= size[0] - 1
-        or columns[-1] + left >= size[1] - 1
-    )
+    x, y, width, height = cv2.boundingRect(own.view(np.uint8))
+    left, top = b.left - PAD + x, b.top - PAD + y
+    return width > 0 and (left <= 0 or top <= 0 or left + width >= size[1] or top + height >= size[0])

@@ -20,16 +20,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from common.arrays import Image
+from common.arrays import Bool, Float, Image, Int
 from common.calibration import HsvRange
 from common.errors import CalibrationError
 
 Codes: TypeAlias = npt.NDArray[np.unsignedinteger]
 Places: TypeAlias = npt.NDArray[np.uint32]
 HUES = 180
-PLANES = (
-    16  # of the table that are made at once: a thread beside a busy loop waits for its turn at every step
-)
 # Skin of every tone lies between red and orange, less saturated than markers (Kalbfleisch: collides with red, orange
 # and yellow markers, which is why those are not used).
 SKIN = HsvRange(hsv_low=(174, 60, 70), hsv_high=(22, 190, 255))
@@ -38,8 +35,12 @@ SKIN = HsvRange(hsv_low=(174, 60, 70), hsv_high=(22, 190, 255))
 class ColourTable:
     """Look-up table from a colour to the markers it may belong to.
 
-    Bit m of an entry belongs to marker m, the bit after the last marker to skin. Holds 2^24 entries of 1, 2, 4 or 8
-    bytes, shared with the tables made of it for another light, the map of bytes, and work buffers of the scan.
+    Bit m of an entry belongs to marker m, the bit after the last marker to skin. Tables made of it for another light
+    share the entries.
+
+    Attributes:
+        entries: (2^24,) codes of 1, 2, 4 or 8 bytes, at the sum of the `places` of blue, green and red.
+        places: (3, 256) what each byte of blue, green and red adds to the index.
     """
 
     def __init__(self, ranges: Sequence[HsvRange]) -> None:
@@ -49,32 +50,19 @@ class ColourTable:
         self.count = len(ranges)
         self.bits = tuple(1 << m for m in range(self.count))
         self.skin = 1 << self.count
-        self._table = _build([*ranges, SKIN])
+        self.entries = _build([*ranges, SKIN])
+        self.places = _places(np.tile(np.arange(256, dtype=np.uint8), (3, 1)))
         self._bytes: Image | None = None  # (3, 256); None: as they are
         self._coarse: Codes | None = None  # for the scan, where they are others
-        self._places = _places(np.tile(np.arange(256, dtype=np.uint8), (3, 1)))
         self._index = np.empty((0, 0), np.int64)
-        self._codes: Codes = np.empty((0, 0), self._table.dtype)
-
-    @property
-    def entries(self) -> Codes:
-        """Return the codes (2^24,), at the sum of the `places` of blue, green and red."""
-        return self._table
-
-    @property
-    def places(self) -> Places:
-        """Return the index contribution (3, 256) of each byte of blue, green and red."""
-        return self._places
+        self._codes: Codes = np.empty((0, 0), self.entries.dtype)
 
     def white_balanced(self, tables: Image) -> "ColourTable":
-        """Return the table for images whose bytes are mapped first by `tables` (3, 256).
-
-        Takes about 1 ms; shares the entries, so that ranges cannot come to overlap.
-        """
+        """The table for images whose bytes are mapped first by `tables` (3, 256): 1 ms."""
         other = copy(self)
         other._bytes = tables if self._bytes is None else np.take_along_axis(self._bytes, tables, axis=1)
-        other._coarse, other._places = _coarse(self._table, other._bytes), _places(other._bytes)
-        other._index, other._codes = np.empty((0, 0), np.int64), np.empty((0, 0), self._table.dtype)
+        other._coarse, other.places = _coarse(self.entries, other._bytes), _places(other._bytes)
+        other._index, other._codes = np.empty((0, 0), np.int64), np.empty((0, 0), self.entries.dtype)
         return other
 
     def codes(self, image: Image) -> Codes:
@@ -87,8 +75,8 @@ class ColourTable:
             mapped = np.zeros((1, 256, 4), np.uint8)
             mapped[0, :, :3] = self._bytes.T
             pixels = np.ascontiguousarray(packed).view(np.uint8).reshape(-1, 1, 4)
-            return self._table.take(cv2.LUT(pixels, mapped).view(np.uint32).reshape(packed.shape))
-        return self._table.take(packed & 0xFFFFFF)
+            return self.entries.take(cv2.LUT(pixels, mapped).view(np.uint32).reshape(packed.shape))
+        return self.entries.take(packed & 0xFFFFFF)
 
     def scan(
         self, image: Image, step: int, dx: int = 0, dy: int = 0, size: tuple[int, int] | None = None
@@ -109,23 +97,18 @@ class ColourTable:
         # A pixel is read as four bytes, of which the last belongs to its neighbour. Read from one byte before it
         # instead, the first belongs to its other neighbour; so one of the two never leaves the image.
         late = dx % step == step - 1
-        words = np.ndarray(
-            (height, width),
-            "<u4",
-            buffer=image,
-            offset=dy * row + 3 * dx - late,
-            strides=(step * row, 3 * step),
-        )
+        offset, strides = dy * row + 3 * dx - late, (step * row, 3 * step)
+        words = np.ndarray((height, width), "<u4", buffer=image, offset=offset, strides=strides)
         if self._index.shape != words.shape:
             self._index = np.empty(words.shape, np.int64)
-            self._codes = np.empty(words.shape, self._table.dtype)
+            self._codes = np.empty(words.shape, self.entries.dtype)
         # the scan looks colours up in steps of 8 levels: what it uses of the table fits a cache
         coarse = 0xF8F8F8
         if self._coarse is not None:
             np.bitwise_and(words >> (11 if late else 3), coarse >> 3, out=self._index, casting="unsafe")
             return self._coarse.take(self._index, out=self._codes, mode="clip")
         np.bitwise_and(words >> 8 if late else words, coarse, out=self._index, casting="unsafe")
-        return self._table.take(self._index, out=self._codes, mode="clip")
+        return self.entries.take(self._index, out=self._codes, mode="clip")
 
 
 def table_of(markers: Sequence[str], ranges: Mapping[str, HsvRange] | None, where: str) -> ColourTable:
@@ -139,32 +122,54 @@ def table_of(markers: Sequence[str], ranges: Mapping[str, HsvRange] | None, wher
     return ColourTable([ranges[name] for name in markers])
 
 
-def in_range(hsv: Image, colour: HsvRange) -> npt.NDArray[np.bool_]:
+def in_range(hsv: Image, colour: HsvRange) -> Bool:
     """Mask of pixels (..., 3) OpenCV HSV inside a range; the hue wraps through 0."""
-    h, s, v = hsv[..., 0], hsv[..., 1], hsv[..., 2]
-    low, high = colour.hsv_low, colour.hsv_high
-    hue = (h >= low[0]) & (h <= high[0]) if low[0] <= high[0] else (h >= low[0]) | (h <= high[0])
-    return hue & (s >= low[1]) & (s <= high[1]) & (v >= low[2]) & (v <= high[2])
+    h, s, v = (_within(hsv[..., k], low, high) for k, (low, high) in enumerate(_limits(colour)))
+    return h & s & v
+
+
+def hue_distance(hues: npt.ArrayLike, hue: npt.ArrayLike) -> Float:
+    """Distance of hues 0..180 on their circle."""
+    d = np.abs(np.asarray(hues, np.float64) - np.asarray(hue, np.float64))
+    return np.minimum(d, HUES - d)
+
+
+def hue_span(colour: HsvRange) -> tuple[float, float]:
+    """Middle of a range on the circle of hues, and how far it reaches to either side."""
+    low = colour.hsv_low[0]
+    half = (colour.hsv_high[0] - low) % HUES / 2.0
+    return (low + half) % HUES, half
+
+
+def _limits(colour: HsvRange) -> list[tuple[int, int]]:
+    return list(zip(colour.hsv_low, colour.hsv_high, strict=True))
+
+
+def _within(levels: Int | Image, low: int, high: int) -> Bool:
+    """Whether levels are in a range, which wraps where `low` is above `high`."""
+    above, below = levels >= low, levels <= high
+    return above & below if low <= high else above | below
 
 
 def _build(ranges: Sequence[HsvRange]) -> Codes:
     """Build the table: a colour has the bits that its H, S and V all have."""
-    kind = next(
-        t for t, n in ((np.uint8, 8), (np.uint16, 16), (np.uint32, 32), (np.uint64, 64)) if len(ranges) <= n
-    )
-    hues, saturations, values = (_bits(ranges, channel, kind) for channel in range(3))
-    table = np.empty(
-        (256, 256, 256), kind
-    )  # red, green, blue: the byte order of a packed little-endian pixel
-    planes = np.empty((PLANES, 256, 256, 3), np.uint8)
-    planes[..., 0] = np.arange(256)
-    planes[..., 1] = np.arange(256)[:, None]
-    for start in range(0, 256, PLANES):
-        planes[..., 2] = np.arange(start, start + PLANES)[:, None, None]
-        flat = cv2.cvtColor(planes.reshape(PLANES * 256, 256, 3), cv2.COLOR_BGR2HSV)
+    level = np.arange(256)
+    bits: Codes = np.zeros((3, 256), np.min_scalar_type((1 << len(ranges)) - 1))  # of levels of H, S and V
+    for m, colour in enumerate(ranges):
+        for channel, (low, high) in zip(bits, _limits(colour), strict=True):
+            channel[_within(level, low, high)] |= bits.dtype.type(1 << m)
+    count = 16  # planes made at once: a thread beside a busy loop waits for its turn at every step
+    # red, green, blue: the byte order of a packed little-endian pixel
+    table: Codes = np.empty((256, 256, 256), bits.dtype)
+    planes = np.empty((count, 256, 256, 3), np.uint8)
+    planes[..., 0] = level
+    planes[..., 1] = level[:, None]
+    for start in range(0, 256, count):
+        planes[..., 2] = level[start : start + count, None, None]
+        flat = cv2.cvtColor(planes.reshape(count * 256, 256, 3), cv2.COLOR_BGR2HSV)
         hue, saturation, value = np.asarray(cv2.split(flat), np.uint8)
-        codes = table[start : start + PLANES].reshape(PLANES * 256, 256)  # a view
-        codes[:] = hues.take(hue) & saturations.take(saturation) & values.take(value)
+        codes = table[start : start + count].reshape(count * 256, 256)  # a view
+        codes[:] = bits[0].take(hue) & bits[1].take(saturation) & bits[2].take(value)
     return table.reshape(-1)
 
 
@@ -179,18 +184,6 @@ def _coarse(table: Codes, levels: Image) -> Codes:
     coarse = np.empty((32, 256, 256), table.dtype)  # the rest is never asked, and never becomes memory
     coarse[:, :32, :32] = table.reshape(256, 256, 256)[np.ix_(red, green, blue)]
     return coarse.reshape(-1)
-
-
-def _bits(ranges: Sequence[HsvRange], channel: int, kind: type[np.unsignedinteger]) -> Codes:
-    """Return the codes (256,) of the levels of one channel of HSV; hue wraps."""
-    level = np.arange(256)
-    codes: Codes = np.zeros(256, kind)
-    for m, colour in enumerate(ranges):
-        low, high = colour.hsv_low[channel], colour.hsv_high[channel]
-        above, below = level >= low, level <= high
-        wraps = channel == 0 and low > high
-        codes[above | below if wraps else above & below] |= kind(1 << m)
-    return codes
 
 
 SCALE = 4  # distance of the grid's lines [px]
@@ -217,6 +210,21 @@ class Blob(NamedTuple):
     top: int
     right: int
     bottom: int
+
+    def holds(self, u: float, v: float, margin: float = 0.0) -> bool:
+        """Whether a point is in the box, or as near to it as `margin` [px]."""
+        return (
+            self.left - margin <= u <= self.right + margin and self.top - margin <= v <= self.bottom + margin
+        )
+
+    def meets(self, other: "Blob", margin: float = 0.0) -> bool:
+        """Whether the boxes overlap, or are less than `margin` [px] apart."""
+        return (
+            self.left < other.right + margin
+            and other.left < self.right + margin
+            and self.top < other.bottom + margin
+            and other.top < self.bottom + margin
+        )
 
 
 def find_blobs(
@@ -291,14 +299,9 @@ def with_fragments(blob: Blob, options: Sequence[Blob], extent: float, whole: fl
     fragment_unknown = 0.3
     most = 1.3 * max(whole - blob.area, 0.0) if known else fragment_unknown * blob.area
     area, u, v = blob.area, blob.u * blob.area, blob.v * blob.area
+    least = max(8.0, 0.04 * blob.area)  # px^2, and of the largest piece: what is smaller is noise or fringe
     for piece in options:
-        fragment_share = 0.04  # of the largest piece, below which a piece is noise or fringe
-        fragment_least = 8.0  # px^2
-        if (
-            piece is blob
-            or piece.area > blob.area
-            or piece.area < max(fragment_least, fragment_share * blob.area)
-        ):
+        if piece is blob or not least <= piece.area <= blob.area:
             continue
         # Boxes leave open where between two points of the grid the colour ends: on average half of it, on each side.
         gap = max(piece.left - right, left - piece.right, piece.top - bottom, top - piece.bottom) + SCALE

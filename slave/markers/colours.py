@@ -17,14 +17,14 @@ from typing import cast
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from msgspec.structs import replace
 
 from common.arrays import Bool, Float, Image
 from common.calibration import HsvRange
 from common.errors import FitError
-from common.geometry.srgb import gain_tables, to_linear
-from slave.markers.classify import HUES, SKIN, in_range
+from common.geometry.srgb import to_linear
+from slave.markers.classify import HUES, SKIN, hue_distance, hue_span, in_range
+from slave.markers.illuminant import undone
 from slave.markers.white_balance import hsv as hsv_of_light
 
 HUE_GROW = 10  # how far the hue of one marker varies between its lit and its shadow side
@@ -56,7 +56,7 @@ def calibrate(image: Image, clicks: Mapping[str, tuple[float, float]]) -> list[C
     `image`: (H, W, 3) BGR. `clicks`: Marker -> (u, v) [px], a pixel on its colour. Raises FitError: A click is
     outside the image or not on a marker colour, or two colours have the same hue.
     """
-    hsv = cast(Image, cv2.cvtColor(image, cv2.COLOR_BGR2HSV))
+    hsv = hsv_of(image)
     paint = {name: grow(hsv, name, uv) for name, uv in clicks.items()}
     skin, background = surroundings(hsv, paint)
     return rows_of({name: hsv[mask] for name, mask in paint.items()}, hsv[skin], hsv[background])
@@ -121,15 +121,10 @@ def grow(hsv: Image, name: str, click: tuple[float, float]) -> Bool:
     if not (0 <= u < width and 0 <= v < height):
         raise FitError(f"clicks.{name}: ({u}, {v}) is outside the {width}x{height} image")
     clicked = hsv[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2].reshape(-1, 3)
-    hue, saturation, value = (
-        circular_median(clicked[:, 0]),
-        np.median(clicked[:, 1]),
-        np.median(clicked[:, 2]),
-    )
+    saturation = np.median(clicked[:, 1])
     if saturation < PALE:
         raise FitError(f"clicks.{name}: ({u}, {v}) is not on a paint: saturation {saturation:.0f} of 255")
-    near = hue_distance(hsv[..., 0], hue) <= HUE_GROW
-    near &= (hsv[..., 1] >= 0.55 * saturation) & (hsv[..., 2] >= 0.4 * value)
+    near = like(hsv, circular_median(clicked[:, 0]), clicked)
     _, labels = cv2.connectedComponents(near.astype(np.uint8), connectivity=4)
     label = labels[v, u]
     mask = labels == label
@@ -140,6 +135,23 @@ def grow(hsv: Image, name: str, click: tuple[float, float]) -> Bool:
     return mask
 
 
+def hsv_of(image: Image) -> Image:
+    """OpenCV HSV of a BGR image."""
+    return cast(Image, cv2.cvtColor(image, cv2.COLOR_BGR2HSV))
+
+
+def like(hsv: Image, hue: float, sample: Image) -> Bool:
+    """Pixels (...) of a hue, but rims and highlights of a thing like `sample` (N, 3)."""
+    saturation, value = np.median(sample[:, 1]), np.median(sample[:, 2])
+    pure = (hsv[..., 1] >= 0.55 * saturation) & (hsv[..., 2] >= 0.4 * value)
+    return pure & (hue_distance(hsv[..., 0], hue) <= HUE_GROW)
+
+
+def dilated(mask: Image, px: int) -> Bool:
+    """Mask (H, W) of 0 and 1, wider by so many pixels in rows and columns."""
+    return np.asarray(cv2.dilate(mask, np.ones((2 * px + 1, 2 * px + 1), np.uint8))) != 0
+
+
 def circular_median(hues: Image) -> float:
     """Median of hues 0-179 on the circle: taken around their mean direction."""
     angle = hues.astype(np.float64) * (2.0 * np.pi / HUES)
@@ -148,21 +160,10 @@ def circular_median(hues: Image) -> float:
     return float((mean + np.median(offset)) * HUES / (2.0 * np.pi) % HUES)
 
 
-def hue_separation(a: float, b: float) -> float:
-    """Distance of two hues on the circle of 180."""
-    return min((a - b) % HUES, (b - a) % HUES)
-
-
-def hue_distance(hues: npt.NDArray[np.number], hue: float) -> Float:
-    """Distance on the hue circle of 180, of many hues from one."""
-    d = np.abs(hues.astype(np.float64) - hue)
-    return np.minimum(d, HUES - d)
-
-
 def _refuse_ambiguous(hue: Mapping[str, float]) -> None:
     names = sorted(hue, key=lambda name: hue[name])
     for a, b in zip(names, names[1:] + names[:1], strict=True):
-        if a != b and hue_separation(hue[a], hue[b]) < HUE_SEPARATION:
+        if a != b and hue_distance(hue[a], hue[b]) < HUE_SEPARATION:
             raise FitError(
                 f"markers {a} and {b} have nearly the same hue ({hue[a]:.0f}, {hue[b]:.0f}): repaint one"
             )
@@ -171,8 +172,7 @@ def _refuse_ambiguous(hue: Mapping[str, float]) -> None:
 def surroundings(hsv: Image, paint: Mapping[str, Bool]) -> tuple[Bool, Bool]:
     """Masks of skin near the markers, and of all but marker colour and its rim."""
     union = np.any(list(paint.values()), axis=0).astype(np.uint8)
-    rim = cv2.dilate(union, np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)) != 0
-    near = cv2.dilate(union, np.ones((2 * AROUND + 1, 2 * AROUND + 1), np.uint8)) != 0
+    rim, near = dilated(union, RIM), dilated(union, AROUND)
     skin_like = (hue_distance(hsv[..., 0], 12.0) <= 12.0) & (hsv[..., 1] >= PALE) & (hsv[..., 1] <= 190)
     return near & ~rim & skin_like, ~rim
 
@@ -219,14 +219,6 @@ def _share(pixels: Image, colour: HsvRange) -> float:
     return float(in_range(pixels, colour).mean()) if len(pixels) else 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class ColourSample:
-    """What came of one click: all ranges now, and what the new one catches."""
-
-    ranges: dict[str, HsvRange]
-    row: ColourRow
-
-
 class SampledColours:
     """Pixels of the marker colours picked since the start, and the ranges made.
 
@@ -245,14 +237,15 @@ class SampledColours:
         marker: str,
         uv: tuple[float, float],
         ranges: Mapping[str, HsvRange],
-    ) -> ColourSample:
+    ) -> tuple[dict[str, HsvRange], ColourRow]:
         """Make the range of a marker from a pixel (u, v) on or near it [px].
 
         `image`: (H, W, 3) BGR; `log_gains`: (3,) of the light against calibration, blue first; `ranges`: of the
-        markers that have one. Raises FitError: no area of one colour, or one like skin, like another marker's, or too
-        large for a marker; the message states what to do.
+        markers that have one. Returns the ranges of all now, and what the new one catches. Raises FitError: no area
+        of one colour, or one like skin, like another marker's, or too large for a marker; the message states what to
+        do.
         """
-        hsv = undone(image, log_gains)
+        hsv = hsv_of(undone(image, log_gains))
         mask = colour_region(hsv, marker, uv)
         pixels = hsv[mask]
         picked = {name: self._samples[name] for name, made in self._made.items() if ranges.get(name) == made}
@@ -274,14 +267,7 @@ class SampledColours:
         pixels_most = 4000  # of one marker colour that are kept
         picked[marker] = pixels[:: max(len(pixels) // pixels_most, 1)]
         self._samples, self._made = picked, made
-        return ColourSample(kept | made, rows[marker])
-
-
-def undone(image: Image, log_gains: Float) -> Image:
-    """HSV (H, W, 3) of a picture as it would be under the light of calibration."""
-    if np.any(log_gains):
-        image = np.asarray(cv2.LUT(image, gain_tables(np.exp(-log_gains)).T[None]), np.uint8)
-    return cast(Image, cv2.cvtColor(image, cv2.COLOR_BGR2HSV))
+        return kept | made, rows[marker]
 
 
 def colour_region(hsv: Image, marker: str, uv: tuple[float, float]) -> Bool:
@@ -355,15 +341,16 @@ def _sample_of(colour: HsvRange) -> Image:
     if colour.reference_bgr_linear is not None:
         return np.rint(hsv_of_light(np.array([colour.reference_bgr_linear]))).astype(np.uint8)
     low, high = colour.hsv_low, colour.hsv_high
-    hue = (low[0] + (high[0] - low[0]) % HUES // 2) % HUES
-    return np.array([[hue, (low[1] + high[1]) // 2, (low[2] + high[2]) // 2]], np.uint8)
+    return np.array([[hue_span(colour)[0], (low[1] + high[1]) // 2, (low[2] + high[2]) // 2]]).astype(
+        np.uint8
+    )
 
 
 def _refuse_like(marker: str, samples: Mapping[str, Image]) -> None:
     hue = circular_median(samples[marker][:, 0])
     for name, pixels in samples.items():
         other = circular_median(pixels[:, 0])
-        if name != marker and hue_separation(hue, other) < HUE_SEPARATION:
+        if name != marker and hue_distance(hue, other) < HUE_SEPARATION:
             raise FitError(
                 f"pick {marker}: its paint has nearly the hue of marker {name} ({hue:.0f}, {other:.0f}): if this is "
                 f"the paint of {name}, click on that of {marker}; if {name} was picked wrongly, forget its colour "

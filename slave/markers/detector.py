@@ -31,7 +31,7 @@ from slave.markers.group import (
     connected,
     on_fringe,
 )
-from slave.markers.outline import Outline, Outlines
+from slave.markers.outline import Outline, outlines_of
 from slave.markers.quality import CLEAR_CONTRAST, Evidence, clarity_of, evidence_of, probability_of
 from slave.markers.scan import Scanned, Scanner
 from slave.markers.track import (
@@ -73,15 +73,19 @@ class Detections:
     clarity: Float
     colour: Float
 
-    def nothing(self) -> "Detections":
-        """The same markers, none of them seen."""
-        return Detections(*(np.full_like(getattr(self, name), np.nan) for name in self.__slots__))
+    @classmethod
+    def none(cls, markers: int) -> "Detections":
+        """So many markers, none of them seen."""
+        shapes = ((2,), (), (), (), (2,), (), (3,))
+        return cls(*(np.full((markers, *shape), np.nan) for shape in shapes))
 
 
 class MarkerDetector:
     """Finds the markers of one camera, frame by frame. Holds one track per marker.
 
     Attributes:
+        markers: What it seeks, in the order of its rows and of the bits of `table`, the colour table in use.
+        ranges: Marker -> its range in the camera file, under the light of calibration.
         windows_only: Only windows of tracked markers are scanned, and strips for lost ones; the first frame is scanned
             whole. May change between two frames.
         ambiguity: Things of a marker's colour that are none, as far as scans saw them.
@@ -113,12 +117,12 @@ class MarkerDetector:
         self._camera = camera
         self._exposure_s = camera.exposure_us * 1e-6
         self._margin = camera.roi_margin
-        self._names = markers
-        self._table = table_of(markers, camera.markers, f"camera {camera.name!r}") if table is None else table
-        self._colours = [(camera.markers or {})[name] for name in markers]
+        self.markers = markers
+        self.table = table_of(markers, camera.markers, f"camera {camera.name!r}") if table is None else table
+        self.ranges: Mapping[str, HsvRange] = camera.markers or {}
         self._free = tuple(markers.index(name) for name in free)
         self._engine = engine
-        engine.prepare(self._table)
+        engine.prepare(self.table)
         self._initial_uv = {
             markers.index(name): uv for name, uv in (initial_uv or {}).items() if name in markers
         }
@@ -126,9 +130,7 @@ class MarkerDetector:
         self._scanner = Scanner(camera.width_px, camera.height_px, engine)
         self._last_ns: int | None = None  # time of the last frame
         self._frame = 0  # frames so far
-        self._outlines = Outlines()
-        self._quality = [0.0] * len(markers)
-        self._lonely = [True] * len(markers)  # no other blob might have been it when it was found
+        self._outlined: set[int] = set()  # markers whose outline holds more than their colour
         self._gains = (1.0, 1.0, 1.0)  # of the light against calibration, blue first
         self.windows_only = False
         self.ambiguity = ColourAmbiguityMonitor(markers)
@@ -136,8 +138,8 @@ class MarkerDetector:
 
     def fresh(self, initial_uv: Mapping[str, tuple[float, float]] | None = None) -> "MarkerDetector":
         """Return a detector of the same camera and colour table without any tracks."""
-        free = [self._names[m] for m in self._free]
-        other = MarkerDetector(self._camera, self._names, initial_uv, self._table, self._engine, free)
+        free = [self.markers[m] for m in self._free]
+        other = MarkerDetector(self._camera, self.markers, initial_uv, self.table, self._engine, free)
         other.windows_only, other._gains = self.windows_only, self._gains
         return other
 
@@ -151,10 +153,8 @@ class MarkerDetector:
             raise ValueError(f"image {image.shape} {image.dtype}, the camera file says {size} uint8")
         image = np.ascontiguousarray(image)
         width = self._camera.width_px
-        windows = [
-            track.window(t_ns, width, self._margin) if track is not None and track.alive(t_ns) else None
-            for track in self._tracks
-        ]
+        alive = [track if track is not None and track.alive(t_ns) else None for track in self._tracks]
+        windows = [None if track is None else track.window(t_ns, width, self._margin) for track in alive]
         scanned = self._look(image, t_ns, windows)
         blobs = scanned.blobs
         chosen = self._decide(scanned, windows)
@@ -165,7 +165,9 @@ class MarkerDetector:
         shift_px: dict[int, float] = {}
         for m in rows:
             if len(blobs[m]) > 1:
-                chosen[m], shift_px[m] = with_fragments(chosen[m], blobs[m], *self._known(m, t_ns))
+                track = alive[m]
+                known = (math.inf, math.nan) if track is None else (track.extent, track.whole)
+                chosen[m], shift_px[m] = with_fragments(chosen[m], blobs[m], *known)
                 alternative = self._alternative(m, chosen[m], blobs, windows[m])
                 if alternative is not None:
                     alternatives[m] = alternative
@@ -173,8 +175,8 @@ class MarkerDetector:
         closely = sorted(alternatives, key=lambda m: -alternatives[m].area)[:2]
         asked = [(m, chosen[m]) for m in rows] + [(m, alternatives[m]) for m in closely]
         alone = [len(blobs[m]) == 1 or _alone(blob, blobs[m]) for m, blob in asked]
-        bits = [self._table.bits[m] for m, _ in asked]
-        measured = self._engine.measure(image, self._table, bits, [blob for _, blob in asked], alone)
+        bits = [self.table.bits[m] for m, _ in asked]
+        measured = self._engine.measure(image, self.table, bits, [blob for _, blob in asked], alone)
         for m, seen in zip(closely, measured[len(rows) :], strict=True):
             if seen is not None:
                 alternatives[m] = alternatives[m]._replace(u=seen.u, v=seen.v)
@@ -185,51 +187,35 @@ class MarkerDetector:
             for m, seen in zip(rows, measured, strict=False)
             if seen is not None and not (seen.thin and (seen.foreign > fringe or seen.area < sliver))
         }
-        outlines = self._outlines.push(image, seen_as, [m for m in seen_as if windows[m] is None])
-        reports: dict[int, tuple[float, ...]] = {}
         self.evidence, self._frame = {}, self._frame + 1
+        due = {m for m in seen_as if alive[m] is None}
+        outlines = outlines_of(image, seen_as, due, self._outlined, self._frame)
+        reports: dict[int, tuple[float, ...]] = {}
         for m, seen in seen_as.items():
-            before = self._tracks[m] if windows[m] is not None else None
+            blob, shift = chosen[m], shift_px.get(m, 0.0)
             reports[m] = self._report(
-                m, before, seen, outlines.get(m), chosen[m], alternatives.get(m), t_ns, shift_px.get(m, 0.0)
+                m, alive[m], seen, outlines.get(m), blob, alternatives.get(m), t_ns, shift
             )
-        values: list[float] = []
-        for m in range(len(self._names)):
-            values += reports.get(m, NOT_SEEN)
         digits = 6  # of what is reported: what comes after them differs between processors
-        result = np.array(values).round(digits).reshape(-1, len(NOT_SEEN)).T
+        table = np.array([reports.get(m, NOT_SEEN) for m in range(len(self.markers))]).round(digits)
         return Detections(
-            result[:2].T, result[2], result[3], result[4], result[5:7].T, result[7], result[8:].T
+            table[:, :2], table[:, 2], table[:, 3], table[:, 4], table[:, 5:7], table[:, 7], table[:, 8:]
         )
 
     @property
-    def table(self) -> ColourTable:
-        """The colour table in use; its bits are in the order of `markers`."""
-        return self._table
-
-    @property
-    def ranges(self) -> Mapping[str, HsvRange]:
-        """Marker -> its range in the camera file, under the light of calibration."""
-        return self._camera.markers or {}
-
-    @property
-    def markers(self) -> tuple[str, ...]:
-        """What it seeks, in the order of its rows."""
-        return self._names
+    def plain(self) -> "MarkerDetector":
+        """Itself, as of the detectors that wrap one."""
+        return self
 
     def adopt(self, other: "MarkerDetector") -> None:
         """Go on with the tracks of another detector, of the markers that both seek."""
         self._initial_uv = {}
-        if other._names == self._names:
+        if other.markers == self.markers:
             self._tracks, self._scanner, self.ambiguity = other._tracks, other._scanner, other.ambiguity
-            self._last_ns, self._frame, self._outlines = other._last_ns, other._frame, other._outlines
-            self._quality, self._lonely = other._quality, other._lonely
-            return
-        tracks = dict(zip(other._names, other._tracks, strict=True))
-        quality, lonely = (dict(zip(other._names, v, strict=True)) for v in (other._quality, other._lonely))
-        self._quality = [quality.get(name, 0.0) for name in self._names]
-        self._lonely = [lonely.get(name, True) for name in self._names]
-        self._tracks = [tracks.get(name) for name in self._names]
+            self._last_ns, self._frame, self._outlined = other._last_ns, other._frame, other._outlined
+        else:
+            tracks = dict(zip(other.markers, other._tracks, strict=True))
+            self._tracks = [tracks.get(name) for name in self.markers]
 
     def tune(self, camera: CameraCalibration) -> None:
         """Apply a changed exposure (motion smears) or margin. From any thread."""
@@ -237,7 +223,7 @@ class MarkerDetector:
 
     def recolour(self, table: ColourTable, gains: tuple[float, float, float]) -> None:
         """Go on with another prepared table, of a light with `gains` against calibration."""
-        self._table, self._gains = table, gains
+        self.table, self._gains = table, gains
 
     def _report(
         self,
@@ -255,19 +241,19 @@ class MarkerDetector:
         support = 0.0 if outline is None or seen.contrast >= CLEAR_CONTRAST else outline.support
         # sides of the marker: an alternative so near may be taken for it in the next frame
         near = math.hypot(other[0] - seen.u, other[1] - seen.v) < 3.0 * math.sqrt(blob.area)  # NaN is not
-        if before is None:
-            self._lonely[m] = alternative is None
+        lonely = alternative is None if before is None else before.lonely
         clear = seen.contrast >= CLEAR_CONTRAST and not (seen.cut or seen.thin)
         # frames: a clear marker that is tracked is judged in one of so many, and stays what it was between
         judged = 6
         if before is None or not clear or near or m % judged == self._frame % judged:
-            self.evidence[m] = evidence_of(
-                seen, self._gains, self._colours[m], support, near or not self._lonely[m]
-            )
-            self._quality[m] = probability_of(self.evidence[m])
+            colour = self.ranges[self.markers[m]]
+            self.evidence[m] = evidence_of(seen, self._gains, colour, support, near or not lonely)
+            quality = probability_of(self.evidence[m])
+        else:
+            quality = before.quality
         if outline is not None:
             seen = outline.measured(seen)
-        self._tracks[m] = track = advance(self._tracks[m], seen, blob, t_ns)
+        self._tracks[m] = track = advance(self._tracks[m], seen, blob, t_ns, quality, lonely)
         sigma = sigma_of(seen, before, track, self._exposure_s, outline)
         u, v, area = seen.u, seen.v, seen.area
         smear = math.hypot(track.du, track.dv) * self._exposure_s
@@ -275,37 +261,35 @@ class MarkerDetector:
         if before is not None and track.covered and smear < smeared and clear:
             shape, x, y = Ellipse(before.xx, before.xy, before.yy), u - seen.left, v - seen.top
             whole = centre_of(seen.window, shape, x, y)
-            if whole is not None and fits_occlusion(
-                before.hidden(seen.area), shape, whole.u - x, whole.v - y
-            ):
+            hidden = before.hidden(seen.area)
+            if whole is not None and fits_occlusion(hidden, shape, whole.u - x, whole.v - y):
                 u, v, area = seen.left + whole.u, seen.top + whole.v, before.typical
                 sigma = math.hypot(COVERED_PX, whole.rms)
         sigma = math.hypot(sigma, shift_px)
-        clarity = clarity_of(seen, track.whole)
-        if near:
-            clarity *= 0.5
+        clarity = clarity_of(seen, track.whole) * (0.5 if near else 1.0)
         blue, green, red = seen.colour
-        return u, v, area, self._quality[m], sigma, *other, clarity, blue, green, red
+        return u, v, area, quality, sigma, *other, clarity, blue, green, red
 
     def _alternative(self, m: int, blob: Blob, blobs: list[list[Blob]], window: Window | None) -> Blob | None:
         """Return the largest other blob that may be the marker by size and motion."""
         alternative = 0.3  # of the marker's area: a smaller blob is no alternative, nor one as much larger
         least, most = alternative * blob.area, blob.area / alternative
-        others = [b for b in blobs[m] if least < b.area < most]
-        others = [
-            b for b in others if not (blob.left <= b.u <= blob.right and blob.top <= b.v <= blob.bottom)
-        ]
-        if window is not None:
-            others = [b for b in others if math.isfinite(window.cost(b))]
         foreign = [b for n, rest in enumerate(blobs) if n != m for b in rest[:1]]
-        others = [b for b in others if not on_fringe(b, foreign)]
-        return max(others, key=lambda b: b.area) if others else None
+        others = (
+            b
+            for b in blobs[m]
+            if least < b.area < most
+            and not blob.holds(b.u, b.v)
+            and (window is None or math.isfinite(window.cost(b)))
+            and not on_fringe(b, foreign)
+        )
+        return max(others, key=lambda b: b.area, default=None)
 
     def _look(self, image: Image, t_ns: int, windows: list[Window | None]) -> Scanned:
         """Scan the frame as far as it has to be."""
         last_ns, self._last_ns = self._last_ns, t_ns
         if not self.windows_only or not self._scanner.began:
-            return self._scanner.whole(image, self._table)
+            return self._scanner.whole(image, self.table)
         lost: list[int] = []
         places: list[tuple[Window, ...]] = []
         for m, (track, window) in enumerate(zip(self._tracks, windows, strict=True)):
@@ -314,21 +298,11 @@ class MarkerDetector:
                 lost.append(m)
             if track is None or window is None or (track.growing(t_ns) and not seen):
                 places.append(())  # what has grown is more to look at than strips
-            elif (
-                -window.margin <= window.u - track.u <= window.margin
-                and -window.margin <= window.v - track.v <= window.margin
-            ):
+            elif max(abs(window.u - track.u), abs(window.v - track.v)) <= window.margin:
                 places.append((window,))
             else:
                 places.append((window, window._replace(u=track.u, v=track.v)))  # it may have come to rest
-        return self._scanner.around(image, self._table, places, lost)
-
-    def _known(self, m: int, t_ns: int) -> tuple[float, float]:
-        """Largest side [px] and area [px^2] of the whole marker, else inf and nan."""
-        track = self._tracks[m]
-        if track is None or not track.alive(t_ns):
-            return math.inf, math.nan
-        return 1.3 * max(track.width, track.height) + 2.0, track.whole
+        return self._scanner.around(image, self.table, places, lost)
 
     def _decide(self, scanned: Scanned, windows: list[Window | None]) -> dict[int, Blob]:
         """Marker row -> blob; by prediction alone where that answers for all seen."""
@@ -342,13 +316,10 @@ class MarkerDetector:
             if track is None or window is None:
                 certain = False
                 continue
-            costs = [window.cost(blob) for blob in options]
-            cost = min(costs)
+            cost, k = min((window.cost(blob), k) for k, blob in enumerate(options))
             if math.isfinite(cost):
-                tracked[m] = options[costs.index(cost)]
-                certain &= not track.sudden(tracked[m])
-            else:
-                certain = False
+                tracked[m] = options[k]
+            certain &= math.isfinite(cost) and not track.sudden(options[k])
         if certain and connected([blob for m, blob in tracked.items() if m not in self._free]):
             return tracked
         candidates: list[Candidate] = []
@@ -356,7 +327,7 @@ class MarkerDetector:
             others = [blob for n, rest in enumerate(blobs) if n != m for blob in rest[:1]]
             for blob in options:
                 bonus = self._bonus(m, blob, tracked.get(m))
-                skin = scanned.skin_share(self._table.skin, blob)
+                skin = scanned.skin_share(self.table.skin, blob)
                 candidates.append(candidate(m, blob, skin, on_fringe(blob, others), bonus))
         clicked = {c.marker for c in candidates if c.bonus >= CLICKED}
         candidates = [c for c in candidates if c.bonus >= CLICKED or c.marker not in clicked]
@@ -370,12 +341,9 @@ class MarkerDetector:
 
     def _bonus(self, m: int, blob: Blob, tracked: Blob | None) -> float:
         initial_uv = self._initial_uv.get(m)
-        if initial_uv is not None:
-            x = max(blob.left - initial_uv[0], initial_uv[0] - blob.right, 0.0)
-            y = max(blob.top - initial_uv[1], initial_uv[1] - blob.bottom, 0.0)
-            click_reach = 6  # px between a click and the scanned box of its marker
-            if max(x, y) <= click_reach:
-                return CLICKED + math.sqrt(blob.area)  # the click names it; of its fragments take the largest
+        click_reach = 6  # px between a click and the scanned box of its marker
+        if initial_uv is not None and blob.holds(*initial_uv, click_reach):
+            return CLICKED + math.sqrt(blob.area)  # the click names it; of its fragments take the largest
         track = self._tracks[m]
         return TRACKED if blob is tracked and track is not None and not track.sudden(blob) else 0.0
 
@@ -383,10 +351,7 @@ class MarkerDetector:
 def _alone(blob: Blob, options: list[Blob]) -> bool:
     """Return whether no other blob of the colour is in the window of `blob`."""
     return not any(
-        b.left < blob.right + PAD
-        and blob.left - PAD < b.right
-        and b.top < blob.bottom + PAD
-        and blob.top - PAD < b.bottom
+        b.meets(blob, PAD)
         for b in options
         if not (
             b.left >= blob.left and b.right <= blob.right and b.top >= blob.top and b.bottom <= blob.bottom
@@ -396,16 +361,13 @@ def _alone(blob: Blob, options: list[Blob]) -> bool:
 
 def ambiguity_counts(detector: MarkerDetector | None) -> dict[str, int]:
     """Counts of `Health`: ambiguous.<marker>, frames with other things of its colour."""
-    return (
-        {} if detector is None else {f"ambiguous.{name}": n for name, n in detector.ambiguity.frames.items()}
-    )
+    frames = {} if detector is None else detector.ambiguity.frames
+    return {f"ambiguous.{name}": count for name, count in frames.items()}
 
 
 def ambiguity_metrics(detector: MarkerDetector | None) -> dict[str, float]:
     """Metrics of `Health`: ambiguous.<marker>.u and .v, its last place [px]."""
-    if detector is None:
-        return {}
-    places = list(detector.ambiguity.places.items())  # the loop may add one
+    places = [] if detector is None else list(detector.ambiguity.places.items())  # the loop may add one
     return {
         f"ambiguous.{name}.{axis}": value for name, at in places for axis, value in zip("uv", at, strict=True)
     }

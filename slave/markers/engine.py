@@ -47,11 +47,7 @@ def scan_blobs(
     return codes, find_blobs(codes, bits, step, dx, dy)
 
 
-def _nothing(_table: ColourTable) -> None:
-    """Numpy needs no preparation."""
-
-
-NUMPY = Engine(scan_blobs, measure, _nothing)
+NUMPY = Engine(scan_blobs, measure, lambda _table: None)
 
 
 def engine_named(name: str) -> Engine:

@@ -12,7 +12,6 @@ from typing import NamedTuple
 from weakref import WeakKeyDictionary, WeakSet
 
 import numpy as np
-import numpy.typing as npt
 
 from common.arrays import Float, Image, Int
 from slave.markers import centroid, classify
@@ -69,8 +68,6 @@ def _fill(entries: Codes, places: Places, skin: Codes, first: Codes, markers: Co
                 same = any_of & ~flag == all_of & ~flag
                 markers[cell] = all_of & ~flag if same else flag
 
-
-Float32 = npt.NDArray[np.float32]
 
 RULES = Rules(
     centroid.PAD,

@@ -12,13 +12,11 @@ import math
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
-from common.arrays import Float, Image, Int
+from common.arrays import Float, Float32, Image, Int
 from slave.markers.classify import Codes, Places
 from slave.markers.fast_compile import compiled
 
-Float32: TypeAlias = npt.NDArray[np.float32]
 Three: TypeAlias = tuple[float, float, float]
 
 EDGE = 4  # px

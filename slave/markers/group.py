@@ -12,11 +12,12 @@ own area, does not touch the marker, and is no rim between two other colours.
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from statistics import median
 from typing import NamedTuple
 
 import numpy as np
 
-from slave.markers.classify import SCALE, Blob, Codes
+from slave.markers.classify import SCALE, Blob
 
 REACH = 8.5  # marker sizes between neighbours of one hand
 SKIN_REACH = 0.8  # how much farther, relatively, skin around both lets them be
@@ -45,15 +46,6 @@ def candidate(marker: int, blob: Blob, skin: float, fringe: bool, bonus: float) 
     return Candidate(marker, blob, skin, fringe, bonus, math.sqrt(blob.area), score)
 
 
-def skin_share(codes: Codes, skin: int, blob: Blob) -> float:
-    """Share 0..1 of the points around a blob in a scan's codes (H, W) that are skin."""
-    # The box is as wide as the grid leaves open: its border lies one pixel before the points around the blob.
-    top, left = max((blob.top - 1) // SCALE, 0), max((blob.left - 1) // SCALE, 0)
-    window = codes[top : blob.bottom // SCALE + 1, left : blob.right // SCALE + 1]
-    around = window.size - blob.area / SCALE**2
-    return min(1.0, float(np.count_nonzero(window & skin)) / max(around, 1.0))
-
-
 def on_fringe(blob: Blob, others: Iterable[Blob]) -> bool:
     """Return whether `blob` may be the rim of a blob of another colour.
 
@@ -63,17 +55,10 @@ def on_fringe(blob: Blob, others: Iterable[Blob]) -> bool:
     same = 0.7  # areas: a blob in the box of another colour's that is as large may be the rim of it
     fringe_ratio = 4.0  # areas: a blob so much smaller than its neighbour of another colour may be its fringe
     return any(
-        blob.left < other.right  # boxes are as wide as the grid leaves open, so neighbours overlap
-        and other.left < blob.right
-        and blob.top < other.bottom
-        and other.top < blob.bottom
+        blob.meets(other)  # boxes are as wide as the grid leaves open, so neighbours overlap
         for other in others
         if other.area > fringe_ratio * blob.area
-        or (
-            other.area > same * blob.area
-            and other.left - SCALE <= blob.u <= other.right + SCALE
-            and other.top - SCALE <= blob.v <= other.bottom + SCALE
-        )
+        or (other.area > same * blob.area and other.holds(blob.u, blob.v, SCALE))
     )
 
 
@@ -173,8 +158,8 @@ def _fit(candidate: Candidate, members: Sequence[Candidate]) -> float:
     others = [c for c in members if c.marker != candidate.marker and c.blob.area >= SPECK]
     if not others:
         return candidate.score + 1e-4 * candidate.blob.area
-    typical = _median([c.size for c in others])
-    u, v = _median([c.blob.u for c in others]), _median([c.blob.v for c in others])
+    typical = median([c.size for c in others])
+    u, v = median([c.blob.u for c in others]), median([c.blob.v for c in others])
     away = math.hypot(candidate.blob.u - u, candidate.blob.v - v) / (REACH * typical)
     return candidate.score - 0.5 * abs(math.log(candidate.size / typical)) - 0.3 * away
 
@@ -184,24 +169,18 @@ def _strange(candidate: Candidate, others: Sequence[Candidate]) -> bool:
     others = [c for c in others if c.blob.area >= SPECK]
     if not others or candidate.bonus >= TRACKED or candidate.skin >= SKINLESS:
         return False
-    if _median([c.skin for c in others]) < 3.0 * SKINLESS:
+    if median([c.skin for c in others]) < 3.0 * SKINLESS:
         return False
     blob = candidate.blob
     slack = SCALE - 1  # of the box, see `Blob`
     fill = blob.area / (max(blob.right - blob.left - slack, 1) * max(blob.bottom - blob.top - slack, 1))
-    largest, typical = max(c.blob.area for c in others), _median([c.blob.area for c in others])
+    largest, typical = max(c.blob.area for c in others), median([c.blob.area for c in others])
     strange_size = 2.5  # typical areas of the group, and
     strange_share = 0.6  # of its largest: above the lesser of the two, a skinless blob is clutter
     strange_fill = 0.3  # of its box; less is thin like a pen
     return blob.area > min(strange_size * typical, strange_share * largest) or (
         blob.area >= SPECK and fill < strange_fill
     )
-
-
-def _median(values: Sequence[float]) -> float:
-    """Median of a few numbers; numpy's takes 50 times as long for six."""
-    ordered = sorted(values)
-    return 0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
 
 
 LEAST = 40.0  # px^2: specks come and go in every picture
@@ -233,29 +212,11 @@ class ColourAmbiguityMonitor:
             for blob in options:
                 if blob.area < least:
                     break
-                if (own is None or _far(blob, own)) and not on_fringe(blob, rims) and _whole(blob, rims):
+                # nearer to the marker than it is large, it may be a piece of it
+                if own is not None and blob.meets(own, 1 + max(own.right - own.left, own.bottom - own.top)):
+                    continue
+                if not on_fringe(blob, rims) and not any(blob.holds(rim.u, rim.v, SCALE) for rim in rims):
                     name = self._names[m]
                     self.frames[name] += 1
                     self.places[name] = blob.u, blob.v
                     break
-
-
-def _far(blob: Blob, own: Blob) -> bool:
-    """Whether the boxes lie further apart than the marker is large."""
-    apart = 1.0  # of the marker's size between the two: what is nearer may be a piece of it
-    gap = apart * max(own.right - own.left, own.bottom - own.top)
-    return (
-        blob.left > own.right + gap
-        or blob.right < own.left - gap
-        or blob.top > own.bottom + gap
-        or blob.bottom < own.top - gap
-    )
-
-
-def _whole(blob: Blob, others: Sequence[Blob]) -> bool:
-    """Return whether a blob is neither around nor within a marker of another colour."""
-    return not any(
-        blob.left - SCALE <= other.u <= blob.right + SCALE
-        and blob.top - SCALE <= other.v <= blob.bottom + SCALE
-        for other in others
-    )

@@ -19,6 +19,7 @@ proves nothing, and one that is not expected needs more markers.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -92,45 +93,69 @@ def _distance(away: Float, information: Float) -> Float:
     return np.sqrt((away[:, None] @ information @ away[:, :, None])[:, 0, 0])
 
 
+def apart(a: Float, b: Float, dim: float = 0.15) -> float:
+    """How different two lights (3,) look, in log gains of red or blue against green.
+
+    `dim`: what brightness counts against hue: the ranges are wide in it.
+    """
+    blue, green, red = _against_green(a - b)
+    return max(abs(blue), abs(red), dim * abs(green))
+
+
+def undone(image: Image, log_gains: Float) -> Image:
+    """A picture (H, W, 3) BGR as it would be under the light of calibration."""
+    return np.asarray(cv2.LUT(image, gain_tables(np.exp(-log_gains)).T[None]), np.uint8)
+
+
+def different(a: Float, b: Float) -> bool:
+    """Whether two lights, log gains (3,), are clearly different in hue."""
+    return apart(a, b, dim=0.0) > OTHER
+
+
 def bounded(log_gains: Float) -> Float:
     """Clip log gains (3,): green first, then red and blue against it."""
-    blue, green, red = log_gains.tolist()
-    b = min(max(blue - green, -LOG_LIMITS[0]), LOG_LIMITS[0])
-    r = min(max(red - green, -LOG_LIMITS[2]), LOG_LIMITS[2])
-    green = min(max(green, -LOG_LIMITS[1]), LOG_LIMITS[1])
-    return np.array([green + b, green, green + r])
+    return _clipped(log_gains, LOG_LIMITS)
 
 
 def at_bound(log_gains: Float) -> bool:
     """Whether the light has reached a bound, so that it may be beyond."""
+    reached = zip(_against_green(log_gains), LOG_LIMITS, strict=True)
+    return any(abs(value) >= 0.98 * limit for value, limit in reached)
+
+
+def _against_green(log_gains: Float) -> tuple[float, float, float]:
     blue, green, red = log_gains.tolist()
-    reached = (abs(blue - green), abs(green), abs(red - green))
-    return any(a >= 0.98 * limit for a, limit in zip(reached, LOG_LIMITS, strict=True))
+    return blue - green, green, red - green
+
+
+def _clipped(log_gains: Float, limits: Sequence[float]) -> Float:
+    """Log gains (3,) within limits of green, and of blue and red against it."""
+    values = zip(_against_green(log_gains), limits, strict=True)
+    blue, green, red = (min(max(value, -limit), limit) for value, limit in values)
+    return np.array([green + blue, green, green + red])
 
 
 class ColourDrift:
-    """Tracker of the light of one camera: log gains, anchor, time of the last look."""
+    """Tracker of the light of one camera.
+
+    `log_gains`: (3,) of the light against calibration, blue, green, red.
+    """
 
     def __init__(self, reference: Float) -> None:
         """Begin at calibration; `reference`: (M, 3) linear light, positive or ValueError."""
         if reference.ndim != 2 or reference.shape[1] != 3 or not (reference > 0.0).all():
             raise ValueError(f"reference must be (M, 3) positive, got {reference.shape}")
         self._reference = reference
-        self._x = self._anchor = np.zeros(3)
+        self.log_gains = self._anchor = np.zeros(3)
         self._t_ns: int | None = None
-
-    @property
-    def log_gains(self) -> Float:
-        """Log gains (3,) of the light against calibration, blue, green, red."""
-        return self._x
 
     def restart(self, log_gains: Float) -> None:
         """Go on from a light that is known otherwise."""
-        self._x = self._anchor = bounded(log_gains)
+        self.log_gains = self._anchor = bounded(log_gains)
 
     def shift(self, change: Float) -> None:
         """Add a change of the light (3,), in log gains, measured on what stands still."""
-        self._x, self._anchor = bounded(self._x + change), bounded(self._anchor + change)
+        self.log_gains, self._anchor = bounded(self.log_gains + change), bounded(self._anchor + change)
 
     def push(self, colour: Float, clarity: Float, t_ns: int) -> GainFit | None:
         """Learn from the markers of one frame; None where the last look is too recent.
@@ -145,21 +170,18 @@ class ColourDrift:
         self._t_ns = t_ns
         fit = fit_gains(colour, self._reference, np.nan_to_num(clarity), self._anchor)
         time_s = 1.0  # time constant of following
-        blue, green, red = (-math.expm1(-dt_s / time_s) * (fit.log_gains - self._x)).tolist()
-        most = RATE_PER_S * dt_s
-        b, g, r = (min(max(step, -most), most) for step in (blue - green, green, red - green))
-        self._x = bounded(self._x + np.array([g + b, g, g + r]))
+        step = -math.expm1(-dt_s / time_s) * (fit.log_gains - self.log_gains)
+        self.log_gains = bounded(self.log_gains + _clipped(step, [RATE_PER_S * dt_s] * 3))
         anchor_s, many = 5.0, 4  # time constant of the anchor, and how many markers move it
         if np.count_nonzero(np.isfinite(fit.residual)) >= many:
-            self._anchor = self._anchor - math.expm1(-dt_s / anchor_s) * (self._x - self._anchor)
+            self._anchor = self._anchor - math.expm1(-dt_s / anchor_s) * (self.log_gains - self._anchor)
         return fit
 
 
 WAVELENGTHS_NM = np.array([460.0, 540.0, 605.0])  # middles of blue, green and red of common sensors
 STRIDE = 2  # pixels of every second row and column are plenty
-FITS = (
-    3.0  # standard deviations (of three channels, whose mean is 1.6) at which a blob proves nothing any more
-)
+# standard deviations (of three channels, whose mean is 1.6) at which a blob proves nothing any more
+FITS = 3.0
 PROOF = 2  # markers that must fit: one colour fits some light always
 AHEAD = 0.7  # markers by which the best light must lead every light that is clearly another
 OTHER = 0.2  # log gains of red or blue against green by which two lights are clearly different
@@ -167,26 +189,27 @@ LINEAR = to_linear(np.arange(256) / 255.0).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
+class LightEvidence:
     """What speaks for one light."""
 
     log_gains: Float  # (3,) of the light, blue, green, red, after the fit to its blobs
     score: float  # markers that fit, each 0..1
     matched: int  # how many of them
-    residual: Float  # (M,) of each marker in standard deviations; NaN: none found
     proven: bool = False  # enough markers fit, and no clearly different light comes near
     excluded: bool = False  # `PROOF` markers fit a light that leaves the expected one far behind
     beyond: bool = False  # the fit would leave the bounds of red or blue against green
 
 
-def initial_white_balance(image: Image, table: ColourTable, reference: Float, expected: Float) -> Evidence:
+def initial_white_balance(
+    image: Image, table: ColourTable, reference: Float, expected: Float
+) -> LightEvidence:
     """The light that explains most of a picture, and whether the picture proves it.
 
     `reference`: (M, 3) linear light of each marker's core at calibration, blue first; `expected`: (3,) log gains of
     the light that is expected, blue, green, red; 0 at a start.
     """
 
-    def score_of(item: Evidence) -> float:
+    def score_of(item: LightEvidence) -> float:
         if item.beyond:
             return 0.0
         # markers that the expected light is worth by itself
@@ -228,34 +251,21 @@ def off_line(log_gains: Float) -> float:
     return float(abs((red - green) - line[2] / line[0] * (blue - green)))
 
 
-def evidence(half: Image, table: ColourTable, reference: Float, log_gains: Float) -> Evidence:
-    """Evidence of every second pixel (h, w, 3), C-contiguous, for log gains (3,)."""
-    undone = np.asarray(cv2.LUT(half, gain_tables(np.exp(-log_gains)).T[None]), np.uint8)
-    codes = table.codes(undone)
+def evidence(half: Image, table: ColourTable, reference: Float, log_gains: Float) -> LightEvidence:
+    """What every second pixel (h, w, 3), C-contiguous, shows of log gains (3,)."""
+    codes = table.codes(undone(half, log_gains))
     colour = np.full(reference.shape, np.nan)
     for m, bit in enumerate(table.bits):
         if seen := _colours(half, ((codes & bit) != 0).astype(np.uint8)):
             expected = np.log(reference[m]) + log_gains
             colour[m] = min(seen, key=lambda c: float(np.ptp(np.log(c) - expected)))
-    weight = np.ones(len(reference))
-    fit = fit_gains(colour, reference, weight, log_gains)
+    fit = fit_gains(colour, reference, np.ones(len(reference)), log_gains)
     close = np.nan_to_num(1.0 - (fit.residual / FITS) ** 2, nan=0.0)
     score = float(np.maximum(close, 0.0).sum())
     light = bounded(fit.log_gains)
     rounded = 1e-9  # log gains
-    beyond = _separated_hues(light, fit.log_gains) > rounded
-    return Evidence(light, score, int((close > 0.0).sum()), fit.residual, beyond=beyond)
-
-
-def different(a: Float, b: Float) -> bool:
-    """Whether two lights, log gains (3,), are clearly different in hue."""
-    return _separated_hues(a, b) > OTHER
-
-
-def _separated_hues(a: Float, b: Float) -> float:
-    """Log gain of red or blue against green, whichever differs more."""
-    blue, green, red = (a - b).tolist()
-    return max(abs(blue - green), abs(red - green))
+    beyond = apart(light, fit.log_gains, dim=0.0) > rounded
+    return LightEvidence(light, score, int((close > 0.0).sum()), beyond=beyond)
 
 
 def _colours(half: Image, mask: Image) -> list[Float]:

@@ -16,18 +16,14 @@ found, from time to time, and as long as the outline holds more than the colour.
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from common.arrays import Bool, Float, Image
+from common.arrays import Bool, Float, Float32, Image, Int
 from slave.markers.centroid import Measured
 from slave.markers.quality import CLEAR_CONTRAST
-
-Float32: TypeAlias = npt.NDArray[np.float32]
-Whole: TypeAlias = npt.NDArray[np.intp]
 
 RAYS, RADII = 64, 56  # samples of the picture: directions, and on each
 NEAREST, FARTHEST = 0.45, 1.85  # where they begin and end, in radii of the hull
@@ -112,9 +108,9 @@ def _distance(circles: Float) -> Float:
     return du * _COS + dv * _SIN + np.sqrt(np.maximum(radius * radius - across * across, 0.0))
 
 
-def _samples(circles: Float) -> Whole:
+def _samples(circles: Float) -> Int:
     """Samples (N, RAYS) on circles (N, 3): indices of the strength, 0 at the ends."""
-    place = np.rint((_distance(circles) - NEAREST) / _STEP).astype(np.intp)
+    place = np.rint((_distance(circles) - NEAREST) / _STEP).astype(np.int64)
     return np.clip(place, 0, RADII - 1) + RADII * _RAY
 
 
@@ -165,43 +161,41 @@ def _fitted(strength: Float32, circle: Float) -> tuple[float, float, float, floa
     return x, y, radius, float(own.mean()), sigma
 
 
-class Outlines:
-    """Frame count, and markers whose outline holds more than their colour."""
+def outlines_of(
+    image: Image, seen_as: Mapping[int, Measured], due: Collection[int], outlined: set[int], frame: int
+) -> dict[int, Outline]:
+    """Seek the outlines of one frame, those of the largest first.
 
-    def __init__(self) -> None:
-        """No marker has one."""
-        self._frame = 0
-        self._outlined: set[int] = set()
+    Args:
+        image: (H, W, 3) BGR.
+        seen_as: Marker row -> its measurement by colour.
+        due: Rows of those that were not tracked.
+        outlined: Rows of those whose outline held more than their colour of late; kept up to date.
+        frame: Number of the frame.
 
-    def push(
-        self, image: Image, seen_as: Mapping[int, Measured], reset: Collection[int]
-    ) -> dict[int, Outline]:
-        """Seek the outlines of one frame, those of the largest first.
-
-        `seen_as`: marker row -> its measurement by colour; `reset`: rows of those that were not tracked. Returns
-        marker row -> its outline, where that is to be used rather than its colour.
-        """
-        self._frame += 1
-        sought: list[tuple[float, int]] = []
-        for m, seen in seen_as.items():
-            least_px2 = 60.0  # from which an outline can be distinguished from its pixels
-            if seen.area < least_px2 or seen.cut or seen.thin:
-                continue
-            rarely = 120  # in one frame of so many while its colour fills it,
-            due = m in self._outlined or m in reset or self._frame % rarely == m % rarely
-            large_px2 = 500.0  # from which the outline of one of clear contrast is looked at,
-            if seen.contrast < CLEAR_CONTRAST or (seen.area >= large_px2 and due):
-                sought.append((seen.area, m))
-        found: dict[int, Outline] = {}
-        most = 2  # that are sought in one frame
-        for _, m in sorted(sought, reverse=True)[:most]:
-            outline = outline_of(image, seen_as[m])
-            if outline is not None and _holds_more(outline, seen_as[m]):
-                found[m] = outline
-                self._outlined.add(m)
-            else:
-                self._outlined.discard(m)
-        return found
+    Returns marker row -> its outline, where that is to be used rather than its colour.
+    """
+    sought: list[tuple[float, int]] = []
+    for m, seen in seen_as.items():
+        least_px2 = 60.0  # from which an outline can be distinguished from its pixels
+        if seen.area < least_px2 or seen.cut or seen.thin:
+            continue
+        rarely = 120  # in one frame of so many while its colour fills it,
+        large_px2 = 500.0  # from which the outline of one of clear contrast is looked at,
+        if seen.contrast < CLEAR_CONTRAST or (
+            seen.area >= large_px2 and (m in outlined or m in due or frame % rarely == m % rarely)
+        ):
+            sought.append((seen.area, m))
+    found: dict[int, Outline] = {}
+    most = 2  # that are sought in one frame
+    for _, m in sorted(sought, reverse=True)[:most]:
+        outline = outline_of(image, seen_as[m])
+        if outline is not None and _holds_more(outline, seen_as[m]):
+            found[m] = outline
+            outlined.add(m)
+        else:
+            outlined.discard(m)
+    return found
 
 
 def _holds_more(outline: Outline, seen: Measured) -> bool:

@@ -11,12 +11,13 @@ markers are more frequent than markers, less of what is found is right than it r
 """
 
 import math
+from colorsys import rgb_to_hsv
 from operator import mul
 from typing import NamedTuple
 
 from common.calibration import HsvRange
 from slave.markers.centroid import Measured
-from slave.markers.classify import HUES
+from slave.markers.classify import HUES, hue_span
 
 CLEAR_CONTRAST = 6.0  # below it, the colour's mask may be a part of the marker, and its outline is sought
 
@@ -59,9 +60,8 @@ def evidence_of(
     hue = _hue(*(c / gain for c, gain in zip(seen.colour, gains, strict=True)))
     middle, apart = 0.5 * (seen.xx + seen.yy), math.hypot(0.5 * (seen.xx - seen.yy), seen.xy)
     longest, shortest = middle + apart, max(middle - apart, 0.02)
-    low, high = colour.hsv_low, colour.hsv_high
-    half = 0.5 * ((high[0] - low[0]) % HUES) + 0.5
-    away = abs((hue - low[0] - half + 0.5 + HUES / 2) % HUES - HUES / 2) / half
+    middle_hue, half = hue_span(colour)
+    away = abs((hue - middle_hue + HUES / 2) % HUES - HUES / 2) / (half + 0.5)
     largest_contrast = 20.0  # no marker is the more certain beyond it
     return Evidence(
         contrast=math.log(min(max(seen.contrast, 1.0), largest_contrast)),
@@ -85,34 +85,17 @@ def probability_of(evidence: Evidence) -> float:
 
 def clarity_of(seen: Measured, whole: float) -> float:
     """How purely (0.01..1) the core shows the marker; `whole`: its area [px^2]."""
-    area, contrast = seen.area, seen.contrast
-    clarity = math.sqrt(area / whole) if area < whole else 1.0
-    if contrast < CLEAR_CONTRAST:
-        clarity *= contrast / CLEAR_CONTRAST
     small = 40.0  # px^2 below which a colour is hardly that of the marker alone
-    if area < small:
-        clarity *= math.sqrt(area / small)
-    if seen.cut:
-        clarity *= 0.5
-    if seen.thin:
-        clarity *= 0.4
+    clarity = math.sqrt(min(seen.area / whole, 1.0)) * min(seen.contrast / CLEAR_CONTRAST, 1.0)
+    clarity *= (
+        math.sqrt(min(seen.area / small, 1.0)) * (0.5 if seen.cut else 1.0) * (0.4 if seen.thin else 1.0)
+    )
     return min(max(clarity, 0.01), 1.0)
 
 
 def _hue(blue: float, green: float, red: float) -> float:
     """OpenCV's H (0..180) of a colour in linear light."""
-    blue, green, red = _srgb(blue), _srgb(green), _srgb(red)
-    value = max(blue, green, red)
-    span = value - min(blue, green, red)
-    if span <= 0.0:
-        return 0.0
-    if value == red:
-        sector = (green - blue) / span
-    elif value == green:
-        sector = 2.0 + (blue - red) / span
-    else:
-        sector = 4.0 + (red - green) / span
-    return 30.0 * sector % HUES
+    return HUES * rgb_to_hsv(_srgb(red), _srgb(green), _srgb(blue))[0]
 
 
 def _srgb(linear: float) -> float:

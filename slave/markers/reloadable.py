@@ -14,7 +14,6 @@ from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Executor, Future
 from copy import copy
-from functools import partial
 from typing import TypeAlias
 
 import numpy as np
@@ -27,28 +26,17 @@ from slave.cameras.settings import FrameObserver
 from slave.markers.classify import ColourTable, table_of
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.engine import NUMPY, Engine
+from slave.markers.illuminant import apart
 from slave.markers.scan import ScanChoice
-from slave.markers.white_balance import ColourMonitor, ColourWarning, WhiteBalance, apart
+from slave.markers.white_balance import ColourMonitor, ColourWarning, WhiteBalance
 from slave.tuning import CameraFiles, Prepare
 
 
-class NullDetector:
-    """Detector of no marker, for a slave without calibrated colours."""
-
-    def __init__(self, markers: int) -> None:
-        """Answer for so many markers."""
-        one = np.full(markers, np.nan)
-        uv = np.full((markers, 2), np.nan)
-        self._nothing = Detections(uv, one, one, one, uv, one, np.full((markers, 3), np.nan))
-
-    def push(self, image: Image, t_ns: int) -> Detections:
-        """Nothing, whatever there is."""
-        del image, t_ns
-        return self._nothing
-
-
 class CalibratedDetector:
-    """Detector of the markers that have a colour; those `missing` are never seen."""
+    """Detector of the markers that have a colour; those `missing` are never seen.
+
+    `plain`: what detects; None: nothing does.
+    """
 
     def __init__(
         self,
@@ -62,34 +50,24 @@ class CalibratedDetector:
         self.missing = tuple(name for name in markers if name not in calibrated)
         self._rows = [markers.index(name) for name in calibrated]
         self._count = len(markers)
-        self._nothing = NullDetector(len(markers))
-        self._plain = None
+        self.plain: MarkerDetector | None = None
         if calibrated:
             mine = [name for name in free if name in calibrated]
-            self._plain = MarkerDetector(camera, calibrated, engine=engine, free=mine)
-
-    @property
-    def plain(self) -> MarkerDetector | None:
-        """What detects; None: nothing does."""
-        return self._plain
+            self.plain = MarkerDetector(camera, calibrated, engine=engine, free=mine)
 
     def push(self, image: Image, t_ns: int) -> Detections:
         """Detect in one frame; arguments and errors as of `MarkerDetector.push`."""
-        if self._plain is None:
-            return self._nothing.push(image, t_ns)
-        found = self._plain.push(image, t_ns)
-        return Detections(*(self._spread(getattr(found, name)) for name in Detections.__slots__))
+        every = Detections.none(self._count)
+        if self.plain is not None:
+            found = self.plain.push(image, t_ns)
+            for name in Detections.__slots__:
+                getattr(every, name)[self._rows] = getattr(found, name)
+        return every
 
     def tune(self, camera: CameraCalibration) -> None:
         """As of `MarkerDetector`."""
-        if self._plain is not None:
-            self._plain.tune(camera)
-
-    def _spread(self, rows: Float) -> Float:
-        """Rows of all markers, NaN where the colour is not known."""
-        every = np.full((self._count, *rows.shape[1:]), np.nan)
-        every[self._rows] = rows
-        return every
+        if self.plain is not None:
+            self.plain.tune(camera)
 
 
 # log gains of red or blue against green by which a table may take one marker for another: three to six hues
@@ -100,6 +78,7 @@ class LightAdaptiveDetector:
     """Marker detector whose colours follow the light.
 
     Attributes:
+        plain: What detects, with the colours of the light as far as they are followed.
         warnings: What is to be warned of as of the last frame.
         refused: Frames in which nothing was reported because the colours were not fit for the light.
         tables: How many tables were made.
@@ -122,7 +101,7 @@ class LightAdaptiveDetector:
         self._table = table_of(markers, camera.markers, f"camera {camera.name!r}")
         ranges = camera.markers or {}
         reference = np.array([ranges[name].reference_bgr_linear or (np.nan,) * 3 for name in markers])
-        self._detector = MarkerDetector(camera, markers, initial_uv, self._table, engine, free)
+        self.plain = MarkerDetector(camera, markers, initial_uv, self._table, engine, free)
         self._light = WhiteBalance(self._table, reference, (camera.width_px, camera.height_px), workers)
         self._watch = ColourMonitor(markers, ranges)
         self._workers, self._engine = workers, engine
@@ -144,24 +123,19 @@ class LightAdaptiveDetector:
         """Whether colours distinguish markers: light known, and table made for it."""
         return self._light.trusted and apart(self.log_gains, self._in_use) <= REFUSE
 
-    @property
-    def plain(self) -> MarkerDetector:
-        """What detects, with the colours of the light as far as they are followed."""
-        return self._detector
-
     def adopt(self, other: "LightAdaptiveDetector") -> None:
         """Take over the tracks and counts, not the light, of another detector."""
-        self._detector.adopt(other._detector)
+        self.plain.adopt(other.plain)
         self.refused, self.tables = other.refused, other.tables + self.tables
 
     def tune(self, camera: CameraCalibration) -> None:
         """As of `MarkerDetector`; colours see an exposure as a change of the light."""
-        self._detector.tune(camera)
+        self.plain.tune(camera)
 
     def fresh(self, initial_uv: Mapping[str, tuple[float, float]] | None = None) -> "LightAdaptiveDetector":
         """Return a detector of the same camera and light that has seen no marker yet."""
         other = copy(self)
-        other._detector = self._detector.fresh(initial_uv)
+        other.plain = self.plain.fresh(initial_uv)
         return other
 
     def push(self, image: Image, t_ns: int) -> Detections:
@@ -169,14 +143,14 @@ class LightAdaptiveDetector:
         image = np.ascontiguousarray(image)
         self._light.look(image, t_ns)
         self._adapt()
-        found = self._detector.push(image, t_ns)
+        found = self.plain.push(image, t_ns)
         stale = apart(self.log_gains, self._in_use) > REFUSE
         if self._light.proven and not stale:
             self._learn(found, t_ns)
         self.warnings = [*self._near, *self._light.warnings()]
         if stale or not self._light.trusted:
             self.refused += 1
-            return found.nothing()
+            return Detections.none(len(found.area))
         return found
 
     def _learn(self, found: Detections, t_ns: int) -> None:
@@ -186,21 +160,18 @@ class LightAdaptiveDetector:
             self._near = self._watch.push(undone, found.clarity, t_ns)
             self._look_next = False
         else:
-            self._look_next = self._light.learn(found.colour, found.clarity, t_ns) is not None
+            self._look_next = self._light.learn(found.colour, found.clarity, t_ns)
 
     def _adapt(self) -> None:
         """Have a table made where the light has moved; use the one that is ready."""
         step = 0.08  # log gains of red or blue against green from which a new table is made: one or two hues
         if self._making is None and apart(self.log_gains, self._in_use) > step:
             gains = self.log_gains
-            self._making = (
-                gains,
-                self._workers.submit(partial(_white_balanced, self._table, gains, self._engine)),
-            )
+            self._making = gains, self._workers.submit(_white_balanced, self._table, gains, self._engine)
         if self._making is not None and self._making[1].done():
             (self._in_use, job), self._making = self._making, None
             blue, green, red = np.exp(self._in_use).tolist()
-            self._detector.recolour(job.result(), (blue, green, red))
+            self.plain.recolour(job.result(), (blue, green, red))
             self.tables += 1
 
 
@@ -255,9 +226,12 @@ class ReloadableDetector:
     def push(self, image: Image, t_ns: int) -> Detections:
         """Detect in one frame; arguments and errors as of `MarkerDetector.push`."""
         if self._next:
-            coming = self._next.popleft()
-            _hand_over(self._detector, coming)
-            self._detector = coming
+            old, new = self._detector, self._next.popleft()
+            if isinstance(old, LightAdaptiveDetector) and isinstance(new, LightAdaptiveDetector):
+                new.adopt(old)
+            elif old.plain is not None and new.plain is not None:
+                new.plain.adopt(old.plain)
+            self._detector = new
         self._frames.put((image, t_ns))
         found = self._detect(image, t_ns)
         self._found.append((t_ns, found.uv))
@@ -305,7 +279,12 @@ class ReloadableDetector:
     @property
     def plain(self) -> MarkerDetector | None:
         """The present plain detector; None: no colour is known. From any thread."""
-        return plain_of(self._detector)
+        return self._detector.plain
+
+    @property
+    def adaptive(self) -> LightAdaptiveDetector | None:
+        """The present detector if it follows the light. From any thread."""
+        return self._detector if isinstance(self._detector, LightAdaptiveDetector) else None
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -313,31 +292,6 @@ class ReloadableDetector:
         coming = tuple(self._next)
         latest = coming[-1] if coming else self._detector
         return latest.missing if isinstance(latest, CalibratedDetector) else ()
-
-    @property
-    def adapts(self) -> bool:
-        """Whether it follows the light."""
-        return isinstance(self._detector, LightAdaptiveDetector)
-
-    @property
-    def warnings(self) -> list[ColourWarning]:
-        """As of `LightAdaptiveDetector`; none where the colours are fixed."""
-        return self._detector.warnings if isinstance(self._detector, LightAdaptiveDetector) else []
-
-    @property
-    def log_gains(self) -> Float:
-        """Log gains (3,) of the light, blue, green, red; 0 where the colours are fixed."""
-        return self._detector.log_gains if isinstance(self._detector, LightAdaptiveDetector) else np.zeros(3)
-
-    @property
-    def refused(self) -> int:
-        """Count the frames without a report because the colours did not fit the light."""
-        return self._detector.refused if isinstance(self._detector, LightAdaptiveDetector) else 0
-
-    @property
-    def tables(self) -> int:
-        """Colour tables made for another light."""
-        return self._detector.tables if isinstance(self._detector, LightAdaptiveDetector) else 0
 
 
 def marker_changes(
@@ -347,19 +301,18 @@ def marker_changes(
 
     def prepare(old: CameraFiles, new: CameraFiles) -> Callable[[], None] | None:
         made = None
-        looks = [(files.camera.markers, files.rig.free_markers) for files in (old, new)]
-        if looks[0] != looks[1]:
+        if (old.camera.markers, old.rig.free_markers) != (new.camera.markers, new.rig.free_markers):
             made = make(new.camera, new.rig)
-            if detector.adapts and isinstance(made, MarkerDetector):
+            if detector.adaptive is not None and isinstance(made, MarkerDetector):
                 raise CalibrationError(
                     "markers: reference_bgr_linear: the colours in use have it for every marker, and the light is "
                     "followed: restart the slave to change that"
                 )
-        tuned = [
-            (files.camera.exposure_us, files.camera.roi_margin, files.camera.frame_rate_hz)
-            for files in (old, new)
-        ]
-        if made is None and tuned[0] == tuned[1]:
+        tuned = any(
+            getattr(old.camera, name) != getattr(new.camera, name)
+            for name in ("exposure_us", "roi_margin", "frame_rate_hz")
+        )
+        if made is None and not tuned:
             return None
 
         def switch() -> None:
@@ -370,17 +323,3 @@ def marker_changes(
         return switch
 
     return prepare
-
-
-def plain_of(detector: AnyDetector) -> MarkerDetector | None:
-    """What detects; None: nothing does."""
-    return detector if isinstance(detector, MarkerDetector) else detector.plain
-
-
-def _hand_over(old: AnyDetector, new: AnyDetector) -> None:
-    if isinstance(old, LightAdaptiveDetector) and isinstance(new, LightAdaptiveDetector):
-        new.adopt(old)
-        return
-    before, after = plain_of(old), plain_of(new)
-    if before is not None and after is not None:
-        after.adopt(before)

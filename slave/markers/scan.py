@@ -16,12 +16,13 @@ from collections.abc import Iterable, Sequence
 from statistics import median
 from typing import Literal, NamedTuple, TypeAlias
 
+import numpy as np
+
 from common.arrays import Image
 from common.calibration import CameraCalibration
 from slave.drivers import SCANS
 from slave.markers.classify import FRAGMENT_GAP, MAX_CANDIDATES, SCALE, Blob, Codes, ColourTable
 from slave.markers.engine import Engine
-from slave.markers.group import skin_share
 from slave.markers.track import Window
 
 FINER = (SCALE // 2, 0, 0)  # grids: step, dx, dy
@@ -42,12 +43,14 @@ class Scanned(NamedTuple):
     def skin_share(self, skin: int, blob: Blob) -> float:
         """Return the share 0..1 of skin around one of the blobs; `skin`: its bit."""
         x, y = blob.u / SCALE, blob.v / SCALE
-        for (x0, y0, x1, y1), codes in self.parts:
-            if x0 <= x <= x1 and y0 <= y <= y1:
-                dx, dy = SCALE * x0, SCALE * y0
-                left, top, right, bottom = blob.left - dx, blob.top - dy, blob.right - dx, blob.bottom - dy
-                return skin_share(codes, skin, blob._replace(left=left, top=top, right=right, bottom=bottom))
-        raise ValueError(f"{blob} is not of this scan")
+        (x0, y0, _, _), codes = next(
+            (part, codes) for part, codes in self.parts if part[0] <= x <= part[2] and part[1] <= y <= part[3]
+        )
+        # The box is as wide as the grid leaves open: its border lies one pixel before the points around the blob.
+        top, left = max((blob.top - 1) // SCALE - y0, 0), max((blob.left - 1) // SCALE - x0, 0)
+        window = codes[top : blob.bottom // SCALE + 1 - y0, left : blob.right // SCALE + 1 - x0]
+        around = window.size - blob.area / SCALE**2
+        return min(1.0, float(np.count_nonzero(window & skin)) / max(around, 1.0))
 
 
 class Scanner:
@@ -136,7 +139,7 @@ class Scanner:
 
     def _of(self, blob: Blob) -> Part:
         """The part that holds a blob, and around it whatever may be a fragment of it."""
-        reach = FRAGMENT_GAP * math.sqrt(blob.area) + SCALE  # as far as a fragment may begin [px]
+        reach = _reach(blob)
         return self._around(blob.left - reach, blob.top - reach, blob.right + reach, blob.bottom + reach)
 
     def _clipped(self, part: Part, blobs: list[list[Blob]]) -> list[Blob]:
@@ -149,15 +152,20 @@ class Scanner:
         clipped: list[Blob] = []
         for options in blobs:
             for blob in options:
-                reach = FRAGMENT_GAP * math.sqrt(blob.area) + SCALE
-                if (
-                    blob.left - reach < left
-                    or blob.right + reach > right
-                    or blob.top - reach < top
-                    or blob.bottom + reach > bottom
+                reach = _reach(blob)
+                if not (
+                    left <= blob.left - reach
+                    and blob.right + reach <= right
+                    and top <= blob.top - reach
+                    and blob.bottom + reach <= bottom
                 ):
                     clipped.append(blob)
         return clipped
+
+
+def _reach(blob: Blob) -> float:
+    """How far from a blob a fragment of it may begin [px]."""
+    return FRAGMENT_GAP * math.sqrt(blob.area) + SCALE
 
 
 def merged(parts: Iterable[Part]) -> list[Part]:

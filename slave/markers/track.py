@@ -20,13 +20,12 @@ Deviation of the centroid [px]: independent causes, added in squares (numbers of
 """
 
 import math
-from typing import NamedTuple, TypeAlias, cast
+from typing import NamedTuple, cast
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from common.arrays import Float
+from common.arrays import Float, Float32
 from slave.markers.centroid import Measured
 from slave.markers.classify import Blob
 from slave.markers.outline import Outline
@@ -74,6 +73,8 @@ class Track(NamedTuple):
     width: float  # width, height: last box [px]
     height: float
     t_ns: int  # when it was last seen
+    quality: float  # probability that it is a marker, as last judged
+    lonely: bool  # no other blob might have been it when it was found
 
     def alive(self, t_ns: int) -> bool:
         """Return whether the track still predicts where the marker is."""
@@ -95,6 +96,11 @@ class Track(NamedTuple):
         x, y = margin + self.width, margin + self.height
         largest = 4.0  # times the whole area
         return Window(u, v, x, y, margin, self.area, largest * self.whole + 40.0)
+
+    @property
+    def extent(self) -> float:
+        """Largest width or height of the whole marker [px]."""
+        return 1.3 * max(self.width, self.height) + 2.0
 
     def growing(self, t_ns: int) -> bool:
         """Whether the marker has not been seen for so long that its window grows."""
@@ -120,15 +126,16 @@ class Track(NamedTuple):
         return max(0.0, 1.0 - area / self.typical)
 
 
-def advance(track: Track | None, seen: Measured, blob: Blob, t_ns: int) -> Track:
+def advance(
+    track: Track | None, seen: Measured, blob: Blob, t_ns: int, quality: float, lonely: bool
+) -> Track:
     """Return the track after an observation; a lost one begins without velocity."""
-    u, v, area, xx, xy, yy = seen.u, seen.v, seen.area, seen.xx, seen.xy, seen.yy
-    if area < 1.0:
-        area = 1.0
-    width, height = float(blob.right - blob.left), float(blob.bottom - blob.top)
+    u, v, area, xx, xy, yy = seen.u, seen.v, max(seen.area, 1.0), seen.xx, seen.xy, seen.yy
+    box = float(blob.right - blob.left), float(blob.bottom - blob.top)
+    rest = *box, t_ns, quality, lonely
     if track is None or not 0 < t_ns - track.t_ns <= HOLD_NS:
         whole = area if track is None else max(area, 0.5 * track.whole)
-        return Track(u, v, 0.0, 0.0, blob.area, area, whole, area, False, xx, xy, yy, width, height, t_ns)
+        return Track(u, v, 0.0, 0.0, blob.area, area, whole, area, False, xx, xy, yy, *rest)
     dt_s = (t_ns - track.t_ns) * 1e-9
     whole = area
     if area < track.whole:
@@ -146,10 +153,8 @@ def advance(track: Track | None, seen: Measured, blob: Blob, t_ns: int) -> Track
         xx, xy, yy = track.xx, track.xy, track.yy
     else:
         xx, xy, yy = xx + (track.xx - xx) * keep, xy + (track.xy - xy) * keep, yy + (track.yy - yy) * keep
-    return Track(u, v, du, dv, blob.area, area, whole, typical, covered, xx, xy, yy, width, height, t_ns)
+    return Track(u, v, du, dv, blob.area, area, whole, typical, covered, xx, xy, yy, *rest)
 
-
-Float32: TypeAlias = npt.NDArray[np.float32]
 
 RAYS = 48
 KEEP = (RAYS // 2, RAYS * 11 // 20)  # rays that the first rounds trust
@@ -262,16 +267,16 @@ def sigma_of(
     seen: Measured, before: Track | None, track: Track, exposure_s: float, outline: Outline | None = None
 ) -> float:
     """Standard deviation per axis of the centroid [px]; `outline`: of its disc."""
+    blur = BLUR * math.hypot(track.du, track.dv) * exposure_s
     if outline is not None:
-        return math.hypot(outline.sigma, BLUR * math.hypot(track.du, track.dv) * exposure_s)
-    radius = math.sqrt((seen.area if seen.area > 1.0 else 1.0) / math.pi)
+        return math.hypot(outline.sigma, blur)
+    radius = math.sqrt(max(seen.area, 1.0) / math.pi)
     edge_px2 = 0.45  # error times radius
     least_px = 0.06  # at any radius
     edge = math.hypot(edge_px2 / radius, least_px)
     clear = 15.0  # contrast below which the edge is less sure
     if seen.contrast < clear:
         edge *= clear / max(seen.contrast, 1.0)
-    blur = BLUR * math.hypot(track.du, track.dv) * exposure_s
     persistent = 0.3  # how much of a slow loss of area is cover, and not the finger turning away
     hidden = persistent * (1.0 - seen.area / track.whole) if seen.area < track.whole else 0.0
     if before is not None and track.covered:

@@ -17,7 +17,6 @@ counted in spreads, so a colour that flickers is warned of earlier.
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
-from functools import partial
 from typing import ParamSpec, TypeVar
 
 import numpy as np
@@ -26,15 +25,15 @@ import numpy.typing as npt
 from common.arrays import Bool, Float, Image
 from common.calibration import HsvRange
 from common.geometry.srgb import to_linear, to_srgb
-from slave.markers.classify import HUES, ColourTable
+from slave.markers.classify import HUES, ColourTable, hue_distance, hue_span
 from slave.markers.illuminant import (
     AHEAD,
     FITS,
     PROOF,
     STRIDE,
     ColourDrift,
-    Evidence,
-    GainFit,
+    LightEvidence,
+    apart,
     at_bound,
     different,
     evidence,
@@ -78,13 +77,9 @@ class ColourMonitor:
     def __init__(self, names: Sequence[str], ranges: Mapping[str, HsvRange]) -> None:
         """Watch `names`, each in its range."""
         self._names = tuple(names)
-        low = np.array([ranges[name].hsv_low for name in names], np.float64)
-        high = np.array([ranges[name].hsv_high for name in names], np.float64)
-        self._half = (
-            np.where(high[:, 0] >= low[:, 0], high[:, 0] - low[:, 0], high[:, 0] + HUES - low[:, 0]) / 2.0
-        )
-        self._middle = (low[:, 0] + self._half) % HUES
-        self._low, self._range = low, ranges
+        self._middle, self._half = np.array([hue_span(ranges[name]) for name in names]).T
+        self._low = np.array([ranges[name].hsv_low for name in names], np.float64)
+        self._range = ranges
         count = len(self._names)
         self._mean = np.full((count, 3), np.nan)  # hue as the distance from the middle of the range
         self._variance = np.zeros((count, 3))
@@ -140,19 +135,18 @@ class ColourMonitor:
 
     def _ambiguous(self) -> list[ColourWarning]:
         hue = (self._mean[:, 0] + self._middle) % HUES
-        apart = np.abs(hue[:, None] - hue[None, :])
-        apart = np.minimum(apart, HUES - apart)
+        separation = hue_distance(hue[:, None], hue)
         long = self._monitored_s >= LEAST_S
         with np.errstate(invalid="ignore"):
             # hues: two marker colours nearer than this look the same
-            near = (apart < 8.0) & long[:, None] & long[None, :]
+            near = (separation < 8.0) & long[:, None] & long[None, :]
         return [
             ColourWarning(
                 self._names[a],
                 f"markers {self._names[a]} and {self._names[b]} look alike, hues {hue[a]:.0f} and {hue[b]:.0f}: "
                 f"take brighter light, or repaint one",
                 self._names[b],
-                float(apart[a, b]),
+                float(separation[a, b]),
             )
             for a, b in np.argwhere(np.triu(near, 1)).tolist()
         ]
@@ -202,11 +196,10 @@ class LightMeter:
         return self._measure(bytes_, self._still, t_ns)
 
     def _measure(self, bytes_: Image, still: Float, t_ns: int) -> Change:
-        seen = LOG_LIGHT.take(bytes_)
         dt_s, self._t_ns = max(t_ns - self._t_ns, 0) * 1e-9, t_ns
         dark, bright = 12, 250  # bytes beyond which a point measures nothing: noise, or clipped
         usable = ((bytes_ >= dark) & (bytes_ <= bright)).all(axis=1)
-        ratio = seen - still
+        ratio = LOG_LIGHT.take(bytes_) - still
         count = int(np.count_nonzero(usable))
         least = 48  # points that measure something
         if count < least:
@@ -216,8 +209,7 @@ class LightMeter:
         alike = 0.25
         near = usable & (np.abs(ratio - middle) <= alike).all(axis=1)
         agreeing = float(np.count_nonzero(near)) / count
-        sure = agreeing >= AGREE
-        change = np.zeros(3)
+        sure, change = agreeing >= AGREE, np.zeros(3)
         if sure:
             change, self._light = middle - self._light, middle
         # a point that agrees is learnt quickly, one that shows something else slowly
@@ -264,7 +256,7 @@ class WhiteBalance:
         self._plausible = False
         self._poor_fits = 0
         self._tried_ns: int | None = None
-        self._proof: tuple[Float, Future[Evidence]] | None = None
+        self._proof: tuple[Float, Future[LightEvidence]] | None = None
 
     @property
     def log_gains(self) -> Float:
@@ -284,20 +276,19 @@ class WhiteBalance:
         if self._provable and not self.proven:
             self._prove(image, t_ns)
 
-    def learn(self, colour: Float, clarity: Float, t_ns: int) -> GainFit | None:
-        """Update the light as `ColourDrift.push`; None: the last look is too recent."""
+    def learn(self, colour: Float, clarity: Float, t_ns: int) -> bool:
+        """Update the light as `ColourDrift.push`; False: the last look is too recent."""
         fit = self._drift.push(colour, clarity, t_ns)
-        if fit is not None:
-            seen = fit.residual[np.isfinite(fit.residual)]
-            if not seen.size or float(np.median(seen)) <= FITS:
-                self._poor_fits = 0
-            else:
-                self._poor_fits += 1
-                # looks in a row, half a second, in which the markers fit badly and make the light uncertain
-                poor_fits = 5
-                if self._poor_fits >= poor_fits:
-                    self._lose_proof()
-        return fit
+        if fit is None:
+            return False
+        seen = fit.residual[np.isfinite(fit.residual)]
+        poor = seen.size and float(np.median(seen)) > FITS
+        self._poor_fits = self._poor_fits + 1 if poor else 0
+        # looks in a row, half a second, in which the markers fit badly and make the light uncertain
+        poor_fits = 5
+        if self._poor_fits >= poor_fits:
+            self._lose_proof()
+        return True
 
     def warnings(self) -> list[ColourWarning]:
         """What is wrong with the light of all markers."""
@@ -344,7 +335,7 @@ class WhiteBalance:
         if self._proof is None and (self._tried_ns is None or t_ns - self._tried_ns >= again_ns):
             self._tried_ns = t_ns
             job = self._workers.submit(
-                partial(initial_white_balance, image.copy(), self._table, self._reference, self.log_gains)
+                initial_white_balance, image.copy(), self._table, self._reference, self.log_gains
             )
             self._proof = np.zeros(3), job
         if self._proof is not None and self._proof[1].done():
@@ -354,12 +345,3 @@ class WhiteBalance:
             self._plausible = not light.excluded
             if light.proven and different(light.log_gains + since, self.log_gains):
                 self._drift.restart(light.log_gains + since)
-
-
-def apart(a: Float, b: Float, dim: float = 0.15) -> float:
-    """How different two lights (3,) look, in log gains of red or blue against green.
-
-    `dim`: what brightness counts against hue: the ranges are wide in it.
-    """
-    blue, green, red = (a - b).tolist()
-    return max(abs(blue - green), abs(red - green), dim * abs(green))

@@ -13,8 +13,8 @@ SteamVR (ValveSoftware/openvr, issues 878 and 1490), so its end is confirmed.
 
 import importlib
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol, cast
+from collections.abc import Callable, Mapping
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -28,60 +28,14 @@ from slave.sources import Reporting
 INSTALL = "pip install 'phalanx-hand[vive]', on a PC with an x86 processor; elsewhere use --device survive"
 
 
-class VrSystem(Protocol):
-    """`openvr.IVRSystem`: the devices of a SteamVR that runs."""
-
-    def getDeviceToAbsoluteTrackingPose(
-        self, origin: int, predictedSecondsToPhotonsFromNow: float, trackedDevicePoseArray: Any
-    ) -> Sequence[Any]:
-        """Return `TrackedDevicePose_t` of all devices, predicted to after the call."""
-        ...
-
-    def getTrackedDeviceClass(self, deviceIndex: int) -> int:
-        """What kind of device it is; 0: there is none."""
-        ...
-
-    def getStringTrackedDeviceProperty(self, deviceIndex: int, prop: int) -> str:
-        """A property in words. Raises `OpenVRError` where the device has none."""
-        ...
-
-    def pollNextEvent(self, event: Any) -> bool:
-        """Fill `event` with the oldest one; False: there is none."""
-        ...
-
-    def acknowledgeQuit_Exiting(self) -> None:
-        """SteamVR may end; without it SteamVR ends the program."""
-        ...
-
-
-class Library(Protocol):
-    """The module `openvr`."""
-
-    VRApplication_Background: int
-    TrackingUniverseRawAndUncalibrated: int
-    TrackedDeviceClass_GenericTracker: int
-    TrackedDeviceClass_Controller: int
-    TrackedDeviceClass_HMD: int
-    TrackingResult_Running_OK: int
-    Prop_SerialNumber_String: int
-    VREvent_Quit: int
-    k_unMaxTrackedDeviceCount: int
-    OpenVRError: type[Exception]
-    VREvent_t: type[Any]
-
-    def init(self, applicationType: int) -> VrSystem:
-        """Connect to SteamVR. Raises `OpenVRError`."""
-        ...
-
-    def shutdown(self) -> None:
-        """Let go of SteamVR."""
-        ...
+Library: TypeAlias = Any  # the module `openvr`
+VrSystem: TypeAlias = Any  # its `IVRSystem`: the devices of a SteamVR that runs
 
 
 def load_library() -> Library:
     """Import the module; TrackerError: not installed, or no code for this machine."""
     try:
-        return cast(Library, importlib.import_module("openvr"))
+        return importlib.import_module("openvr")
     except ImportError as error:
         raise TrackerError(f"--device openvr: the library openvr is not installed: {INSTALL}") from error
     except (OSError, ValueError) as error:  # of its shared library, which it loads at once
@@ -133,7 +87,7 @@ class OpenVrTracker(Reporting):
         """
         self._name, self._serial, self._clock, self._stop = name, serial, clock, stop
         self._library = loader()
-        self._system: VrSystem | None = connect(self._library)
+        self._system: VrSystem = connect(self._library)  # None: closed
         self._period_ns = round(1e9 / rate_hz)
         self._next_ns = clock.now_ns()
         self._index: int | None = None
@@ -212,59 +166,42 @@ class OpenVrTracker(Reporting):
         return self._index
 
     def _search(self, system: VrSystem) -> int | None:
-        serials = self._devices(system)
-        if self._serial is not None:
-            for index, (kind, serial) in serials.items():
-                if serial == self._serial and kind != self._library.TrackedDeviceClass_HMD:
-                    return index
-            return None
-        trackers = {
-            index: serial
-            for index, (kind, serial) in serials.items()
-            if kind == self._library.TrackedDeviceClass_GenericTracker
-        }
-        if len(trackers) > 1:
+        """The only tracker; or the tracker or controller of the serial number."""
+        library = self._library
+        kinds = library.TrackedDeviceClass_GenericTracker, library.TrackedDeviceClass_Controller
+        trackers: dict[int, str] = {}
+        for index in range(library.k_unMaxTrackedDeviceCount):
+            kind = system.getTrackedDeviceClass(index)
+            if kind not in (kinds[:1] if self._serial is None else kinds):
+                continue
+            try:
+                serial = system.getStringTrackedDeviceProperty(index, library.Prop_SerialNumber_String)
+            except library.OpenVRError:
+                continue
+            if self._serial in (None, serial):
+                trackers[index] = serial
+        if self._serial is None and len(trackers) > 1:
             there = ", ".join(trackers.values())
             raise TrackerChoiceError(
                 f"SteamVR has several trackers, {there}: say with --serial which one sits on the object"
             )
         return next(iter(trackers), None)
 
-    def _devices(self, system: VrSystem) -> dict[int, tuple[int, str]]:
-        """Number -> kind and serial number of all devices that move."""
-        kinds = (
-            self._library.TrackedDeviceClass_GenericTracker,
-            self._library.TrackedDeviceClass_Controller,
-            self._library.TrackedDeviceClass_HMD,
-        )
-        found: dict[int, tuple[int, str]] = {}
-        for index in range(self._library.k_unMaxTrackedDeviceCount):
-            kind = system.getTrackedDeviceClass(index)
-            if kind not in kinds:
-                continue
-            try:
-                serial = system.getStringTrackedDeviceProperty(index, self._library.Prop_SerialNumber_String)
-            except self._library.OpenVRError:
-                continue
-            found[index] = (kind, serial)
-        return found
-
-    def _valid(self, pose: object) -> tuple[Float, Float] | None:
+    def _valid(self, pose: Any) -> tuple[Float, Float] | None:
         """Place and turn of a `TrackedDevicePose_t`, if it is one to rely on."""
-        if not getattr(pose, "bDeviceIsConnected", False):
+        if not pose.bDeviceIsConnected:
             self._counts["absent"] += 1
             return None
-        tracked = getattr(pose, "eTrackingResult", None) == self._library.TrackingResult_Running_OK
-        if not (tracked and getattr(pose, "bPoseIsValid", False)):
+        if pose.eTrackingResult != self._library.TrackingResult_Running_OK or not pose.bPoseIsValid:
             self._counts["lost_itself"] += 1
             return None
-        return matrix34(getattr(pose, "mDeviceToAbsoluteTracking", None))
+        return matrix34(pose.mDeviceToAbsoluteTracking)
 
 
-def matrix34(matrix: object) -> tuple[Float, Float] | None:
+def matrix34(matrix: Any) -> tuple[Float, Float] | None:
     """`HmdMatrix34_t` as place (3,) [m], quaternion (4,) wxyz; None: it is no pose."""
-    rows = np.array([list(row) for row in getattr(matrix, "m", ())], float)
-    if rows.shape != (3, 4) or not np.isfinite(rows).all():
+    rows = np.array([list(row) for row in matrix.m], float)
+    if not np.isfinite(rows).all():
         return None
     axes = rows[:, :3]
     unit_within = 1e-3

@@ -160,7 +160,12 @@ SLEWED = 600e-6  # at most 500 ppm by NTP, and the crystals
 
 
 class SurviveDevice:
-    """Push machine that dates the poses of one device."""
+    """Push machine that dates the poses of one device.
+
+    Attributes:
+        last_ns: When its newest message holds [ns]; None: there is none yet.
+        counts: Events: `broken.` lines by reason, `clock_steps`, `gone`, poses of `others`.
+    """
 
     def __init__(self, name: str, wanted: str | None) -> None:
         """Begin with a program that was just started.
@@ -173,18 +178,18 @@ class SurviveDevice:
         self._serials: dict[str, str] = {}
         self._posed: list[str] = []
         self._seq = -1
-        self._last_ns: int | None = None
-        self._counts: Counter[str] = Counter()
+        self.last_ns: int | None = None
+        self.counts: Counter[str] = Counter()
 
     def push(self, data: bytes, arrival_ns: int) -> list[TrackerPose]:
         """Poses in bytes of `arrival_ns`; TrackerChoiceError: devices, and none selected."""
-        ours = [one for found in self._decoder.push(data) if (one := self._ours(found)) is not None]
+        ours = [one for found in self._decoder.push(data) if (one := self.take(found)) is not None]
         dated = [(one, self._observe(one, arrival_ns)) for one in ours]  # all, before one becomes a time
         poses: list[TrackerPose] = []
         for one, possible in dated:
             t_ns = self._clock.at(round(one.t_s * 1e9))
-            if not possible or (self._last_ns is not None and t_ns <= self._last_ns):
-                self._counts["broken.time"] += 1
+            if not possible or (self.last_ns is not None and t_ns <= self.last_ns):
+                self.counts["broken.time"] += 1
                 continue
             poses.append(self.numbered(t_ns, one))
         return poses
@@ -192,43 +197,35 @@ class SurviveDevice:
     def numbered(self, t_ns: int, pose: Pose | None) -> TrackerPose:
         """The next message; None: it does not know where it is."""
         self._seq += 1
-        self._last_ns = t_ns
+        self.last_ns = t_ns
         place = np.full(3, np.nan) if pose is None else np.array(pose.position_m)
         quaternion = np.full(4, np.nan) if pose is None else np.array(pose.orientation_wxyz)
         return TrackerPose(self._name, 0, self._seq, t_ns, place, quaternion)
 
-    @property
-    def last_ns(self) -> int | None:
-        """When its newest message holds [ns]; None: there is none yet."""
-        return self._last_ns
-
-    @property
-    def counts(self) -> Mapping[str, int]:
-        """Events: `broken.` lines by reason, `clock_steps`, `gone`, poses of `others`."""
-        return self._counts
-
     def there(self) -> str:
         """Return the devices that have reported anything, as text for people."""
-        names = list(dict.fromkeys([*self._posed, *self._serials]))
-        return ", ".join(self._called(one) for one in names) or "no device at all"
+        names = dict.fromkeys([*self._posed, *self._serials])
+        texts = (f"{one} (serial {self._serials[one]})" if one in self._serials else one for one in names)
+        return ", ".join(texts) or "no device at all"
 
-    def _ours(self, found: Found) -> Pose | None:
-        """The pose if it is one of the device that is meant."""
+    def take(self, found: Found) -> Pose | None:
+        """Take note of a line; the pose if it is one of the device that is meant."""
         if isinstance(found, Fault):
-            self._counts[f"broken.{found.name.lower()}"] += 1
+            self.counts[f"broken.{found.name.lower()}"] += 1
         elif isinstance(found, Serial):
             self._serials[found.device] = found.serial
         elif isinstance(found, Gone):
-            self._counts["gone"] += self._is_ours(found.device)
+            self.counts["gone"] += self.is_ours(found.device)
         else:
             if found.device not in self._posed:
                 self._posed.append(found.device)
-            if self._is_ours(found.device):
+            if self.is_ours(found.device):
                 return found
-            self._counts["others"] += 1
+            self.counts["others"] += 1
         return None
 
-    def _is_ours(self, device: str) -> bool:
+    def is_ours(self, device: str) -> bool:
+        """Whether it is meant; TrackerChoiceError: several have poses, none selected."""
         if self._wanted is not None:
             return self._wanted in (device, self._serials.get(device))
         if len(self._posed) > 1:
@@ -237,15 +234,11 @@ class SurviveDevice:
             )
         return True
 
-    def _called(self, device: str) -> str:
-        serial = self._serials.get(device)
-        return device if serial is None else f"{device} (serial {serial})"
-
     def _observe(self, pose: Pose, arrival_ns: int) -> bool:
         try:
             return self._clock.observe(round(pose.t_s * 1e9), arrival_ns)
         except ClockSteppedError:  # somebody set the wall clock
-            self._counts["clock_steps"] += 1
+            self.counts["clock_steps"] += 1
             self._clock = DeviceClock(SLEWED)
             return self._clock.observe(round(pose.t_s * 1e9), arrival_ns)
 
@@ -341,10 +334,9 @@ class SurviveTracker(Reporting):
             self._logged_ns = now_ns
             wanted = "any device" if self._wanted is None else self._wanted
             _LOG.warning("%s: no pose of %s; there is %s", self._program, wanted, self._device.there())
-        t_ns = now_ns - SILENT_NS // 2
-        if self._device.last_ns is not None:
-            t_ns = max(t_ns, self._device.last_ns + 1)
-        return self._device.numbered(t_ns, None)
+        last_ns = self._device.last_ns
+        least_ns = 0 if last_ns is None else last_ns + 1
+        return self._device.numbered(max(now_ns - SILENT_NS // 2, least_ns), None)
 
 
 class SurviveFile:
@@ -391,27 +383,21 @@ class SurviveFile:
 def _poses_of(path: Path, wanted: str | None) -> list[Pose]:
     """The poses of one device in a file, in order of time; raises as `SurviveFile`."""
     decoder, device = LineDecoder(), SurviveDevice("check", wanted)
-    names: dict[str, str] = {}
     every: list[Pose] = []
-    broken: Counter[str] = Counter()
     try:
         with path.open("rb") as plain:
             packed = plain.read(2) == b"\x1f\x8b"
         with cast(BinaryIO, gzip.open(path)) if packed else path.open("rb") as file:
             while data := file.read(_CHUNK):
                 for found in decoder.push(data):
+                    device.take(found)
                     if isinstance(found, Pose):
                         every.append(found)
-                    elif isinstance(found, Serial):
-                        names[found.device] = found.serial
-                    else:
-                        broken[type(found).__name__] += 1
-                device.push(data, 0)  # refuses a choice that nobody made
     except EOFError:  # a packed file whose recorder was killed: what is there is whole
         pass
     except OSError as error:
         raise TrackerError(f"{path}: cannot read: {error.strerror or error}") from error
-    ours = [one for one in every if wanted is None or wanted in (one.device, names.get(one.device))]
+    ours = [one for one in every if device.is_ours(one.device)]
     if not ours:
         what = "a device" if wanted is None else wanted
         raise TrackerError(f"{path}: no pose of {what}; there is {device.there()}")

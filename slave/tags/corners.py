@@ -63,23 +63,15 @@ def refine(
         nothing = np.full(len(uv), np.nan)
         return Corners(uv, nothing, nothing, nothing)
     shift = np.array([left, top], np.float64)
-    fitted = _fit(light, shift, uv, cells, lens, inner)
-    passes = 2
-    for _ in range(passes - 1):
-        fitted = _fit(light, shift, fitted.uv, cells, lens, inner)
-    return fitted
+    coarse = _fit(light, shift, uv, cells, lens, inner)
+    return _fit(light, shift, coarse.uv, cells, lens, inner)
 
 
 def _fit(
     light: Float, shift: Float, uv: Float, cells: int, lens: CameraModel | None, inner: Float | None
 ) -> Corners:
-    begin, end = uv, np.roll(uv, -1, axis=1)  # side k: from corner k to the next, clockwise
-    along = end - begin
-    length = np.maximum(np.linalg.norm(along, axis=-1), 1e-3)
-    outward = np.stack([along[..., 1], -along[..., 0]], axis=-1) / length[..., None]
-    x, y = uv[..., 0], uv[..., 1]
-    area = 0.5 * np.abs((x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y).sum(axis=1))
-    cell = area[:, None] / length / cells
+    along, length, outward = _along(uv)  # side k: from corner k to the next, clockwise
+    cell = 0.5 * np.abs(_twice_area(uv))[:, None] / length / cells
     reach_px = 3.5  # to either side of the edge, at most
     # of the border's width that is looked at
     least_reach_px = 1.2
@@ -88,7 +80,7 @@ def _fit(
     margin = np.clip(ends_px / length, 0.02, 0.3)
     place = margin[..., None] + (1.0 - 2.0 * margin[..., None]) * (np.arange(ALONG) + 0.5) / ALONG
     across = reach[..., None] * np.linspace(-1.0, 1.0, ACROSS)
-    on = _on_side(begin, end, place, lens) - shift
+    on = _on_side(uv, along, place, lens) - shift
     at = on[..., :, None, :] + across[..., None, :, None] * outward[..., None, None, :]
     n = len(uv)
     sides = _Sides(
@@ -103,16 +95,28 @@ def _fit(
     # of the contrast: an edge that departs more from the law has something on it,
     coarse_residual = 0.4  # or is that of a small tag whose code is not known yet
     most_residual = coarse_residual if inner is None else 0.15
-    return _met(uv, outward, reach, density, most_residual, _edges(sides))
+    return _met(uv, outward, reach, density, most_residual, *_edges(sides))
 
 
-def _on_side(begin: Float, end: Float, place: Float, lens: CameraModel | None) -> Float:
+def _along(corners: Float) -> tuple[Float, Float, Float]:
+    """Vectors (N, 4, 2) along the sides of quads, lengths (N, 4), normals outward."""
+    along = np.roll(corners, -1, axis=1) - corners
+    length = np.maximum(np.linalg.norm(along, axis=-1), 1e-3)
+    return along, length, np.stack([along[..., 1], -along[..., 0]], axis=-1) / length[..., None]
+
+
+def _twice_area(corners: Float) -> Float:
+    """Twice the areas (N,) of quads, positive where they run clockwise."""
+    x, y = corners[..., 0], corners[..., 1]
+    return (x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y).sum(axis=1)
+
+
+def _on_side(begin: Float, along: Float, place: Float, lens: CameraModel | None) -> Float:
     """Points (N, 4, ALONG, 2) [px] at shares `place` (N, 4, ALONG) of the sides."""
     if lens is None:
-        return begin[..., None, :] + place[..., None] * (end - begin)[..., None, :]
-    a = lens.undistort(begin)
-    b = np.roll(a, -1, axis=1)
-    return lens.distort(a[..., None, :] + place[..., None] * (b - a)[..., None, :])
+        return begin[..., None, :] + place[..., None] * along[..., None, :]
+    begin = lens.undistort(begin)
+    return lens.distort(begin[..., None, :] + place[..., None] * _along(begin)[0][..., None, :])
 
 
 def _sampled(light: Float, at: Float) -> Float:
@@ -135,26 +139,18 @@ class _Sides:
     inner: Float | None  # (S, cells) whether those behind the border are white
 
 
-@dataclass(frozen=True, slots=True)
-class _Lines:
-    """Fitted lines of S sides."""
+def _edges(sides: _Sides) -> tuple[Float, Float, Float]:
+    """Fit S edges: parameters (S, 6) of `_law`, variances of offsets, residuals.
 
-    offset: Float  # (S, 2) how far outward they lie at begin and end [px]
-    variance: Float  # (S, 2) its variances per variance of a sample
-    mean_square: Float  # (S,) of the residuals
-    contrast: Float  # (S,)
-    width: Float  # (S,) of the edge [px]
-
-
-def _edges(sides: _Sides) -> _Lines:
+    Variances (S, 2) are per variance of a sample; residuals (S,) are mean squares.
+    """
     seen, s = sides.seen, len(sides.seen)
     dark, bright = seen[..., :2].mean(axis=(1, 2)), seen[..., -2:].mean(axis=(1, 2))
     p: Float = np.stack([dark, bright, *np.zeros((3, s)), np.full(s, np.log(0.8))], axis=1)
     reach = sides.across[:, -1]
     normal = np.zeros((s, 6, 6))
     residual = np.zeros((s, ALONG * ACROSS))
-    steps = 3
-    for _ in range(steps):
+    for _ in range(3):
         jacobian, model = _law(p, sides)
         residual = (seen - model).reshape(s, -1)
         transposed = jacobian.transpose(0, 2, 1)
@@ -166,7 +162,7 @@ def _edges(sides: _Sides) -> _Lines:
         sharpest_px = 0.25  # an edge
         p[:, 5] = np.clip(p[:, 5], np.log(sharpest_px), np.log(WIDEST_PX))
     variance = np.asarray(np.linalg.inv(normal), np.float64)[:, (2, 3), (2, 3)]
-    return _Lines(p[:, 2:4], variance, (residual**2).mean(axis=1), p[:, 1] - p[:, 0], np.exp(p[:, 5]))
+    return p, variance, (residual**2).mean(axis=1)
 
 
 def _law(p: Float, sides: _Sides) -> tuple[Float, Float]:
@@ -188,14 +184,8 @@ def _law(p: Float, sides: _Sides) -> tuple[Float, Float]:
             -(d + sides.cell[:, None, None]) / width
         )
     plain = dark + (bright - dark) * share
-    parts = (
-        shade * (1.0 - share),
-        shade * share,
-        moved * (1.0 - t),
-        moved * t,
-        plain * (t - 0.5),
-        -height * z,
-    )
+    levels, offsets = (shade * (1.0 - share), shade * share), (moved * (1.0 - t), moved * t)
+    parts = *levels, *offsets, plain * (t - 0.5), -height * z
     return np.stack(parts, axis=-1).reshape(len(p), -1, 6), shade * plain
 
 
@@ -216,19 +206,26 @@ def normal_law(z: Float) -> Float:
 
 
 def _met(
-    uv: Float, outward: Float, reach: Float, density: Float, most_residual: float, line: _Lines
+    uv: Float,
+    outward: Float,
+    reach: Float,
+    density: Float,
+    most_residual: float,
+    edges: Float,
+    variance: Float,
+    mean_square: Float,
 ) -> Corners:
-    """Where the lines of neighbouring sides meet, and how sure that is."""
-    n = len(uv)
-    offset = line.offset.reshape(n, 4, 2)
+    """Where the lines of neighbouring sides meet, and how sure; the last as `_edges`."""
+    dark, bright, *offsets, _, log_width = np.moveaxis(edges.reshape(-1, 4, 6), -1, 0)
+    offset, contrast, width = np.stack(offsets, axis=-1), bright - dark, np.exp(log_width)
+    mean_square = mean_square.reshape(-1, 4)
     bilinear = 9.0 / 4.0  # variance of a pixel against that of what is read between pixels
-    noise = line.mean_square.reshape(n, 4) * np.maximum(bilinear * density, 1.0)
-    contrast, width = line.contrast.reshape(n, 4), line.width.reshape(n, 4)
+    noise = mean_square * np.maximum(bilinear * density, 1.0)
     floor_px = 0.01  # what is left where there is no noise: pixels are squares, sampled by straight lines
     # an edge that is wider is off by so much of what it is wider: motion has its own law
     clear_px, blurred = 0.8, 0.05
     floor = floor_px**2 + (blurred * np.maximum(width - clear_px, 0.0)) ** 2
-    variance = noise[..., None] * line.variance.reshape(n, 4, 2) + floor[..., None]
+    variance = noise[..., None] * variance.reshape(-1, 4, 2) + floor[..., None]
     # Corner k ends side k - 1 and begins side k. Each line measures how far it moved across itself, there.
     normals = np.stack([np.roll(outward, 1, axis=1), outward], axis=-2)
     moved = np.stack([np.roll(offset[..., 1], 1, axis=1), offset[..., 0]], axis=-1)
@@ -239,13 +236,9 @@ def _met(
     met = uv + np.einsum("nkij,nkj->nki", inverse, moved)
     spread = np.einsum("nkij,nkj->nk", inverse**2, edge_variance)
     least_contrast = 0.008  # in linear light, white is 1
-    good = (
-        meet
-        & (np.abs(offset).max(axis=-1) < reach)
-        & (contrast > least_contrast)
-        & (width < 0.99 * WIDEST_PX)
-    )
-    good &= line.mean_square.reshape(n, 4) < (most_residual * contrast) ** 2
+    good = meet & (np.abs(offset).max(axis=-1) < reach)
+    good &= (contrast > least_contrast) & (width < 0.99 * WIDEST_PX)
+    good &= mean_square < (most_residual * contrast) ** 2
     sigma = np.sqrt(spread.mean(axis=1) / 2.0)
     return Corners(met, np.where(good.all(axis=1), sigma, np.nan), contrast.min(axis=1), width.mean(axis=1))
 
@@ -274,17 +267,17 @@ def quads(grey: Image) -> Float:
                 least_fill = 0.4  # of the bounding box of the turned patch
                 if sides.min() >= least_side_px and area >= least_fill * sides.max() * sides.min():
                     found.append((area, corners.astype(np.float64)))
-    found.sort(key=lambda quad: -quad[0])
     if not found:
         return np.zeros((0, 4, 2))
-    most = 16  # quads of one search that are looked at, the largest
-    return _with_margin(_dark_inside(grey, _clockwise(np.array([corners for _, corners in found])))[:most])
+    largest = [corners for _, corners in sorted(found, key=lambda quad: -quad[0])]
+    most = 16  # quads of one search that are looked at
+    return _with_margin(_dark_inside(grey, _clockwise(np.array(largest)))[:most])
 
 
 def _with_margin(corners: Float) -> Float:
     """Move the sides outward: an outline runs through the middles of dark pixels."""
-    along = np.roll(corners, -1, axis=1) - corners
-    along /= np.linalg.norm(along, axis=-1, keepdims=True)
+    along, length, _ = _along(corners)
+    along = along / length[..., None]
     before = np.roll(along, 1, axis=1)
     sine = before[..., 0] * along[..., 1] - before[..., 1] * along[..., 0]
     margin_px = 0.7
@@ -292,16 +285,12 @@ def _with_margin(corners: Float) -> Float:
 
 
 def _clockwise(corners: Float) -> Float:
-    x, y = corners[..., 0], corners[..., 1]
-    upright = (x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y).sum(axis=1) < 0.0
-    return np.where(upright[:, None, None], corners[:, ::-1], corners)
+    return np.where(_twice_area(corners)[:, None, None] < 0.0, corners[:, ::-1], corners)
 
 
 def _dark_inside(grey: Image, corners: Float) -> Float:
     """Those that are darker than what is about them, along all of their sides."""
-    end = np.roll(corners, -1, axis=1)
-    along = end - corners
-    outward = np.stack([along[..., 1], -along[..., 0]], axis=-1) / np.linalg.norm(along, axis=-1)[..., None]
+    along, _, outward = _along(corners)
     on = corners[:, :, None] + PROBES[:, None] * along[:, :, None]
     probe_px = 2.0  # from the edge
     at = np.stack([on + probe_px * outward[:, :, None], on - 0.5 * probe_px * outward[:, :, None]])

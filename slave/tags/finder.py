@@ -53,15 +53,12 @@ class Codes:
 
     def __init__(self, family: TagFamily, numbers: Sequence[int]) -> None:
         """Seek `numbers`; ValueError: the family has no such tag."""
-        self.family: TagFamily = family
         self.ids: Ids = np.array(sorted(numbers), np.uint16)
         code = GRIDS[family].cells
         self.cells = code + 2
         whole = np.array([np.pad(tag_bits(family, int(number)), 1) for number in self.ids], np.float64)
         # A quad that begins with corner t of the print shows the print turned t times anticlockwise.
-        self._patterns = np.stack(
-            [np.rot90(whole, quarter_turns, axes=(1, 2)) for quarter_turns in range(4)], axis=1
-        )
+        self._patterns = np.stack([np.rot90(whole, t, axes=(1, 2)) for t in range(4)], axis=1)
         self.inner = np.stack([whole[:, 1], whole[:, :, -2], whole[:, -2, ::-1], whole[:, ::-1, 1]], axis=1)
         self.sure, self.expected = SURE[code], EXPECTED[code]
 
@@ -151,10 +148,6 @@ class _Track:
     def expected(self, t_ns: int) -> Float:
         return self.uv + self.speed * (min(t_ns - self.t_ns, VELOCITY_NS) * 1e-9)
 
-    @property
-    def size(self) -> float:
-        return float(np.ptp(self.uv, axis=0).max())
-
 
 class TagFinder:
     """Finder of the tags of one camera's objects: a track per tag, the next part."""
@@ -171,11 +164,6 @@ class TagFinder:
         self._tracks: dict[int, _Track] = {}
         self._cycle = -1  # which part is next; negative before the first frame
         self._idle = 0
-
-    @property
-    def ids(self) -> tuple[int, ...]:
-        """Numbers of all tags that are sought, rising."""
-        return tuple(sorted(int(number) for codes in self._codes for number in codes.ids))
 
     def fresh(self) -> "TagFinder":
         """A finder of the same tags that has seen nothing yet."""
@@ -224,7 +212,7 @@ class TagFinder:
         found: dict[int, tuple[Float, float]],
     ) -> None:
         """Fit and read the tracked tags of a family where they must be by now."""
-        rows = [row for row, number in enumerate(codes.ids) if int(number) in tracks]
+        rows = [row for row, number in enumerate(codes.ids.tolist()) if number in tracks]
         if not rows:
             return
         begun = np.array([tracks[int(codes.ids[row])].expected(t_ns) for row in rows])
@@ -266,23 +254,18 @@ class TagFinder:
         """Return the boxes in which lost tags may be, and those beside found ones."""
         boxes: list[Box] = []
         for number, track in tracks.items():
-            margin = 40.0 / 640.0  # of the image's width, as of markers: how far it may have gone astray
-            astray = (
-                0.0
-                if number in found
-                else margin * self._size[1] * (1.0 + (t_ns - track.t_ns) / VELOCITY_NS / 4)
-            )
-            uv = found[number][0] if number in found else track.expected(t_ns)
             near = 0.9  # of a tag's size about it, where the next face of its box may be
-            boxes.append(self._about(uv, near * track.size + astray))
+            margin = near * float(np.ptp(track.uv, axis=0).max())
+            if number in found:
+                uv = found[number][0]
+            else:
+                uv = track.expected(t_ns)
+                astray = 40.0 / 640.0  # of the image's width, as of markers: how far it may have gone
+                margin += astray * self._size[1] * (1.0 + (t_ns - track.t_ns) / VELOCITY_NS / 4)
+            ends = np.floor(uv.min(axis=0) - margin), np.ceil(uv.max(axis=0) + margin)
+            left, top, right, bottom = np.clip(ends, 0, self._size[::-1]).astype(int).ravel().tolist()
+            boxes.append((left, top, right, bottom))
         return _joined(boxes)
-
-    def _about(self, uv: Float, margin: float) -> Box:
-        height, width = self._size
-        low, high = np.floor(uv.min(axis=0) - margin), np.ceil(uv.max(axis=0) + margin)
-        left, top = np.clip(low, 0, [width, height]).astype(int).tolist()
-        right, bottom = np.clip(high, 0, [width, height]).astype(int).tolist()
-        return left, top, right, bottom
 
     def _part(self, seen: bool) -> list[Box]:
         """The part of the image that is searched in this frame, if any."""

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 SHARE = 0.8  # of the time between two frames that markers and tags together may take
 
 
-class Pace:
+class SearchBudget:
     """Grants searches out of the time that frames leave.
 
     What a frame leaves of its share of the time since the frame before is saved until a search fits into it, and no
@@ -34,29 +34,23 @@ class Pace:
     """
 
     def __init__(self, rate_hz: float) -> None:
-        """For a camera of this rate."""
+        """For a camera of this rate; `takes_ns`: what a search takes of late [ns]."""
         self._period_ns = 1e9 / rate_hz
-        self._left_ns = 0.0
-        self._takes_ns = 0.0
+        self._left_ns = self.takes_ns = 0.0
         self._frame_ns: int | None = None
         self._sought_ns: int | None = None
 
-    @property
-    def takes_ns(self) -> float:
-        """What a search takes of late [ns]."""
-        return self._takes_ns
-
     def grants(self, t_ns: int, spent_ns: int) -> bool:
         """Whether tags may be searched in a frame whose markers took `spent_ns`."""
-        since_ns = (
-            self._period_ns if self._frame_ns is None else max(float(t_ns - self._frame_ns), self._period_ns)
-        )
+        since_ns = self._period_ns
+        if self._frame_ns is not None:
+            since_ns = max(float(t_ns - self._frame_ns), since_ns)
         self._frame_ns = t_ns
-        most = max(self._takes_ns, SHARE * self._period_ns)
+        most = max(self.takes_ns, SHARE * self._period_ns)
         self._left_ns = min(max(self._left_ns + SHARE * since_ns - spent_ns, -most), most)
         longest_ns = 250_000_000  # without a search: half of what an object is held for without its tags
         late = self._sought_ns is None or t_ns - self._sought_ns >= longest_ns
-        granted = late or self._left_ns >= self._takes_ns
+        granted = late or self._left_ns >= self.takes_ns
         if granted:
             self._sought_ns = t_ns
         return granted
@@ -64,18 +58,17 @@ class Pace:
     def took(self, spent_ns: int) -> None:
         """A search took so long."""
         self._left_ns -= spent_ns
-        known = self._takes_ns > 0.0
-        learning = 0.2  # weight of the newest search in what one is expected to take
-        self._takes_ns += (spent_ns - self._takes_ns) * (learning if known else 1.0)
+        newest = 0.2 if self.takes_ns > 0.0 else 1.0  # weight in what a search is expected to take
+        self.takes_ns += (spent_ns - self.takes_ns) * newest
 
 
 class LiveTags:
-    """Finds the tags of frames. Holds the finder in use, if any, its pace and counts."""
+    """Finds the tags of frames. Holds the finder in use, if any, budget and counts."""
 
     def __init__(self, camera: CameraCalibration, objects: Sequence[ObjectProfile]) -> None:
         """Seek the tags of `objects`, of which none may have any; raises as `TagFinder`."""
         self._camera = camera.name
-        self._pace = Pace(camera.frame_rate_hz)
+        self._budget = SearchBudget(camera.frame_rate_hz)
         self._finder = finder_of(camera, objects)
         self._searched = self._skipped = self._found = 0
 
@@ -84,23 +77,15 @@ class LiveTags:
         finder = self._finder
         if finder is None:
             return None
-        if not self._pace.grants(frame.t_ns, spent_ns):
+        if not self._budget.grants(frame.t_ns, spent_ns):
             self._skipped += 1
             return None
         began_ns = time.perf_counter_ns()
         found = finder.push(frame.image, frame.t_ns)
-        message = TagDetections(
-            self._camera,
-            session,
-            frame.seq,
-            frame.t_ns,
-            frame.ready_t_ns,
-            found.ids,
-            found.uv,
-            found.sigma_px,
-            frame.t_sigma_ns,
-        )
-        self._pace.took(time.perf_counter_ns() - began_ns)
+        when = frame.seq, frame.t_ns, frame.ready_t_ns
+        seen = found.ids, found.uv, found.sigma_px
+        message = TagDetections(self._camera, session, *when, *seen, frame.t_sigma_ns)
+        self._budget.took(time.perf_counter_ns() - began_ns)
         self._searched += 1
         self._found += len(found.ids)
         return message
@@ -117,7 +102,7 @@ class LiveTags:
             "tags.searched": self._searched,
             "tags.skipped": self._skipped,
             "tags.found": self._found,
-            "tags.search_us": round(self._pace.takes_ns * 1e-3),
+            "tags.search_us": round(self._budget.takes_ns * 1e-3),
         }
 
 

@@ -117,14 +117,6 @@ def find(cycle: StrobeCycle, view: WristView, engine: Engine = NUMPY) -> WristFo
     return WristFound(cycle, laser, tips)
 
 
-class NullWristDetector:
-    """Detector that never completes a strobe cycle."""
-
-    def push(self, frame: Frame) -> None:
-        """Nothing, whatever there is."""
-        del frame
-
-
 def view_of(files: CameraFiles) -> WristView:
     """View of camera, rig and hand; CalibrationError names file and key it lacks."""
     if files.hand is None:

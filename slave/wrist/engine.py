@@ -2,28 +2,22 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
 
-from common.arrays import Bool, Image, Int
+from common.arrays import Bool, Float32, Image, Int
 from slave.drivers import engine_of
 from slave.wrist.fingertips import Search, candidates
 from slave.wrist.runs import FingerLines, Runs, lines, measure
-from slave.wrist.seams import Float32, energy, minimum_cost_paths
-
-Energy: TypeAlias = Callable[[Image, int], Float32]
-MinimumCostPaths: TypeAlias = Callable[[Float32, tuple[int, ...]], Int]
-Lines: TypeAlias = Callable[[Image, int], tuple[Runs, Bool]]
-Measure: TypeAlias = Callable[[Runs, Int, int], FingerLines]
+from slave.wrist.seams import energy, minimum_cost_paths
 
 
 @dataclass(frozen=True, slots=True)
 class Engine:
     """The steps in which much is done with few numbers: functions of those names."""
 
-    energy: Energy
-    minimum_cost_paths: MinimumCostPaths
-    lines: Lines
-    measure: Measure
+    energy: Callable[[Image, int], Float32]
+    minimum_cost_paths: Callable[[Float32, tuple[int, ...]], Int]
+    lines: Callable[[Image, int], tuple[Runs, Bool]]
+    measure: Callable[[Runs, Int, int], FingerLines]
     candidates: Search
 
 

@@ -8,27 +8,25 @@ import math
 import cv2
 import numpy as np
 
-from common.arrays import Bool, Float, Image, Int
+from common.arrays import Bool, Float, Float32, Image, Int
 from slave.markers.fast_compile import compiled
 from slave.wrist import fast_tips, runs, seams
 from slave.wrist.engine import Engine
-from slave.wrist.runs import NO_RUNS, FingerLines, Runs
-from slave.wrist.seams import MARGIN, Float32
+from slave.wrist.runs import NO_LINES, FingerLines, Runs, RunSettings
+from slave.wrist.seams import MARGIN
 
 
 def lines(laser: Image, first_row: int) -> tuple[Runs, Bool]:
     """As `runs.lines`."""
     band, least, corner = runs.bright(laser, first_row)
     if not band.size:
-        return NO_RUNS, np.empty(0, dtype=np.bool_)
+        return NO_LINES
     most = band.size // 2 + band.shape[0] + 1
     whole = np.empty((most, 3), dtype=np.int64)
     parts = np.empty((most, 2))
-    of = runs.SETTINGS
-    limits = (of.thickest_px, of.flat_px, of.top, of.of_peak, of.of_flat)
-    count = _scan(np.asarray(band, np.uint8), np.asarray(least, np.uint8), corner, limits, whole, parts)
+    count = _scan(band, least, corner, runs.SETTINGS, whole, parts)
     if not count:
-        return NO_RUNS, np.empty(0, dtype=np.bool_)
+        return NO_LINES
     whole, parts = whole[:count], parts[:count]
     order, line, joins = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.int64)
     number = _link(whole, parts, runs.SETTINGS.jump_px, order, line, joins)
@@ -40,15 +38,9 @@ def lines(laser: Image, first_row: int) -> tuple[Runs, Bool]:
 
 @compiled
 def _scan(
-    band: Image,
-    least: Image,
-    corner: tuple[int, int],
-    limits: tuple[int, int, float, float, float],
-    whole: Int,
-    parts: Float,
+    band: Image, least: Image, corner: tuple[int, int], limits: RunSettings, whole: Int, parts: Float
 ) -> int:
     """Scan an image on its side for runs: column, rows (N, 3); row and peak (N, 2)."""
-    thickest, flat_px, top, of_peak, of_flat = limits
     left, first = corner
     count = 0
     width, height = band.shape
@@ -62,12 +54,12 @@ def _scan(
             while y < height and band[x, y] > least[x, y]:
                 peak = max(peak, int(band[x, y]))
                 y += 1
-            if y - begin > thickest:
+            if y - begin > limits.thickest_px:
                 continue
             flat = 0
             for k in range(begin, y):
-                flat += band[x, k] > top * peak
-            base = (of_flat if flat >= flat_px else of_peak) * peak
+                flat += band[x, k] > limits.top * peak
+            base = (limits.of_flat if flat >= limits.flat_px else limits.of_peak) * peak
             weight = moment = 0.0
             for k in range(begin, y):
                 above = max(band[x, k] - base, 0.0)
@@ -135,15 +127,21 @@ def _link(whole: Int, parts: Float, jump: float, order: Int, line: Int, joins: I
 def measure(runs_: Runs, finger: Int, width_px: int) -> FingerLines:
     """As `runs.measure`."""
     out = np.zeros((6, 5))
-    limits = (runs.STEEPEST, runs.LONG, width_px)
-    _measure(runs_.column, runs_.row, runs_.peak, runs_.first, finger, limits, out)
-    line, u, v, apart, cut, brightest = out
-    return FingerLines(line, np.stack([u, v], axis=-1), apart, cut > 0.0, brightest)
+    _measure(runs_.column, runs_.row, runs_.peak, runs_.first, finger, width_px, runs.SETTINGS, out)
+    line, u, v, split_px, cut, brightest = out
+    return FingerLines(line, np.stack([u, v], axis=-1), split_px, cut > 0.0, brightest)
 
 
 @compiled
 def _measure(
-    column: Int, row: Float, peak: Float, first: Int, finger: Int, limits: tuple[float, int, int], out: Float
+    column: Int,
+    row: Float,
+    peak: Float,
+    first: Int,
+    finger: Int,
+    width_px: int,
+    limits: RunSettings,
+    out: Float,
 ) -> None:
     """Over the parts of lines: sums, then centroids."""
     longest = np.zeros(5)
@@ -165,7 +163,7 @@ def _measure(
                 u += column[k]
                 v += row[k]
                 out[5, of] = max(out[5, of], peak[k])
-                if column[k] < 1 or column[k] > limits[2] - 2:
+                if column[k] < 1 or column[k] > width_px - 2:
                     out[4, of] = 1.0
             parts[of] += 1
             columns[of] += count
@@ -186,19 +184,17 @@ def _measure(
 
 
 @compiled
-def _part(
-    column: Int, row: Float, left: int, right: int, of: int, limits: tuple[float, int, int], out: Float
-) -> None:
+def _part(column: Int, row: Float, left: int, right: int, of: int, limits: RunSettings, out: Float) -> None:
     """Add the pieces of one part, from its left end to its right one."""
-    inner = 2 if right - left >= limits[1] else 0
+    inner = 2 if right - left >= limits.long else 0
     for k in range(left - 1, right + 1):
         if k < left or k == right:  # beyond the last run
             end, aside = (left, 1) if k < left else (right, -1)
             at = end + inner * aside
             steepness = 0.0
             if inner:
-                steepness = (row[end + limits[1] * aside] - row[at]) / (math.sqrt(5.5) - math.sqrt(2.5))
-                steepness = min(max(steepness, 0.0), limits[0])
+                steepness = (row[end + limits.long * aside] - row[at]) / (math.sqrt(5.5) - math.sqrt(2.5))
+                steepness = min(max(steepness, 0.0), limits.steepest)
             u, v = column[end] - 0.5 * aside, row[at] - steepness * math.sqrt(2.5)
             du, dv = u - column[at], v - row[at]
             u, v = (u + column[at]) / 2.0, (v + row[at]) / 2.0
@@ -297,8 +293,8 @@ def prepare() -> None:
     """
     drawn = np.zeros((64, 640), np.uint8)
     drawn[40:43, 100:400] = 200
-    runs, _ = lines(drawn, 0)
-    measure(runs, np.zeros(len(runs.column), np.int64), drawn.shape[1])
+    found, _ = lines(drawn, 0)
+    measure(found, np.zeros(len(found.column), np.int64), drawn.shape[1])
     straightened = np.zeros((2, len(seams.PRIOR)), np.uint8)
     minimum_cost_paths(energy(straightened, 0), (len(seams.PRIOR),))
     fast_tips.prepare()

@@ -4,88 +4,18 @@ What it makes is what `fingertips.candidates` makes, but for sums added up in an
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from common.arrays import Float, Image, Int
+from common.arrays import Float, Float32, Image, Int
 from slave.markers.fast_compile import compiled
 from slave.wrist import fingertips, led_image, postures
-from slave.wrist.fingertips import Candidates, Ends, LedImage, light_scale, on_plane, reported
-from slave.wrist.led_image import SHRINK, Circles, Float32, WristView
+from slave.wrist.fingertips import Ends, FingertipSettings, LedImage, light_scale, on_plane
+from slave.wrist.led_image import Circles, OutlineSettings, WristView
 from slave.wrist.postures import Postures, postures_of
 
 _COLUMNS = 11  # of what is found of a finger
-
-
-class _Limits(NamedTuple):
-    """Constants of `fingertips`, of which numba's cache knows nothing."""
-
-    least_near: float
-    most_abduction: float
-    within_m: float
-    sigma_m: float
-    most_off_m: float
-    spread_m: float
-    aside_m: float
-    most_aside: float
-    unsure: float
-    variant: float
-    least_ratio: float
-    most_ratio: float
-    thumb_within_m: float
-    thumb_sigma_m: float
-    abduction_sigma: float
-    own_sigma: float
-    own_most: float
-    scale_sigma: float
-    darker: float
-    as_bright: float
-    above_most: float
-    above_unknown: float
-    folded_darker: float
-    folded_as_bright: float
-    unknown_cost: float
-    hidden: float
-    hides: float
-    side: float
-    modes: int
-    mode_within: float
-    apart: float
-    unseen_cost: float
-    at_sigma: float
-    size_sigma: float
-    at_sure: float
-    twist_sigma: float
-    laser_sure_m: float
-    ends_within: float
-    correlated: float
-    end: int
-    bones: int
-    highest: int
-    far: int
-    apex: int
-    upwards: int
-    shrink: int
-
-
-class _Outline(NamedTuple):
-    """Constants of the outline in `led_image`."""
-
-    log: Float32
-    way: Float
-    share: Float32
-    weight: Float32
-    middles: Float32
-    widths: tuple[float, float, float]
-    width: int
-    step: float
-    rim: float
-    least_drop: float
-    firm_drop: float
-    edge_sigma: float
-    middle_sigma: float
-    radius_sigma: float
 
 
 class _Found(NamedTuple):
@@ -98,31 +28,7 @@ class _Found(NamedTuple):
     at: Float
 
 
-_VALUES: dict[str, Any] = fingertips.SETTINGS._asdict() | {
-    "least_near": float(fingertips.LEAST_NEAR),
-    "least_ratio": math.exp(-fingertips.SETTINGS.most_off),
-    "most_ratio": math.exp(fingertips.SETTINGS.most_off),
-    "end": postures.END,
-    "bones": postures.BONES.stop,
-    "highest": postures.HIGHEST,
-    "far": postures.ABOVE.start + fingertips.SETTINGS.far,
-    "apex": postures.APEX,
-    "shrink": SHRINK,
-}
-_LIMITS = _Limits(**{name: _VALUES[name] for name in _Limits._fields})
-_EDGES: dict[str, Any] = led_image.SETTINGS._asdict() | {
-    "log": led_image.LOG,
-    "way": led_image.WAY,
-    "share": led_image.SHARE,
-    "weight": led_image.WEIGHT,
-    "middles": led_image.MIDDLES,
-    "widths": led_image.WIDTHS,
-    "step": led_image.STEP,
-}
-_OUTLINE = _Outline(**{name: _EDGES[name] for name in _Outline._fields})
-
-
-def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) -> Candidates | None:
+def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) -> Ends | None:
     """As `fingertips.candidates`."""
     laser_m = view.on_plane(laser_uv)
     gain = light_scale(image, laser_uv, laser_m)
@@ -130,13 +36,13 @@ def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) ->
         return None
     out = np.full((5, _COLUMNS), np.nan)
     table = postures_of(view)
-    _search(led, image, on_plane(laser_m, view), gain, table, _LIMITS, _OUTLINE, out)
+    _search(led, image, on_plane(laser_m, view), gain, table, fingertips.SETTINGS, led_image.SETTINGS, out)
     finger = np.flatnonzero(np.isfinite(out[:, 0]))
     if not len(finger):
         return None
     x, y, radius, sigma, shown, residual, *ends = out[finger].T
     circle = Circles(np.stack([x, y], axis=-1), radius, sigma, shown)
-    return reported(finger, circle, residual, Ends(np.stack(ends[:2], axis=-1), *ends[2:]))
+    return Ends(finger, circle, residual, np.stack(ends[:2], axis=-1), *ends[2:])
 
 
 def prepare() -> None:
@@ -148,7 +54,9 @@ def prepare() -> None:
     table = Postures(1, some, *whole, *ends)
     image = LedImage.of(np.zeros((1, 1), np.float32), np.zeros((1, 1), np.bool_))
     out, plane = np.empty((5, _COLUMNS)), np.full((5, 2), np.nan, np.float32)
-    _search(np.zeros((1, 1), np.uint8), image, plane, 1.0, table, _LIMITS, _OUTLINE, out)
+    _search(
+        np.zeros((1, 1), np.uint8), image, plane, 1.0, table, fingertips.SETTINGS, led_image.SETTINGS, out
+    )
 
 
 @compiled
@@ -158,8 +66,8 @@ def _search(
     plane: Float32,
     gain: float,
     table: Postures,
-    limits: _Limits,
-    edges: _Outline,
+    limits: FingertipSettings,
+    edges: OutlineSettings,
     out: Float,
 ) -> None:
     """Search each fingertip: outline, residual, `Ends`; NaN: no posture fits."""
@@ -185,7 +93,7 @@ def _search(
             for _ in range(2):
                 _fit(led, circle, open_, edges)
             residual = found.cost[k] + limits.unseen_cost * (1.0 - circle[4])
-            residual += _apart(found, k, table, limits, circle)
+            residual += _outline_cost(found, k, table, limits, circle)
             if residual < least:
                 least = residual
                 best[:] = circle
@@ -196,7 +104,13 @@ def _search(
 
 @compiled
 def _postures(
-    image: LedImage, plane: Float32, gain: float, table: Postures, limits: _Limits, finger: int, found: _Found
+    image: LedImage,
+    plane: Float32,
+    gain: float,
+    table: Postures,
+    limits: FingertipSettings,
+    finger: int,
+    found: _Found,
 ) -> int:
     """Collect postures of index ... little that match laser and brightness."""
     length = table.laser.shape[3]
@@ -248,7 +162,7 @@ def _postures(
 
 @compiled
 def _thumbs(
-    image: LedImage, plane: Float32, gain: float, table: Postures, limits: _Limits, found: _Found
+    image: LedImage, plane: Float32, gain: float, table: Postures, limits: FingertipSettings, found: _Found
 ) -> int:
     count = 0
     for row in range(table.thumb):
@@ -283,7 +197,7 @@ def _take(
     image: LedImage,
     gain: float,
     table: Postures,
-    limits: _Limits,
+    limits: FingertipSettings,
     row: int,
     abduction: float,
     aside: float,
@@ -320,7 +234,7 @@ def _cost(
     abduction: float,
     folded: bool,
     of_finger: bool,
-    limits: _Limits,
+    limits: FingertipSettings,
 ) -> float:
     """Return the cost of a posture, as `fingertips.costs`, without the laser."""
     bones = limits.bones
@@ -352,7 +266,7 @@ def _cost(
         elif not outside and not near[k] > 0.0:
             bright = limits.above_unknown
             if not image.clipped[y, x]:
-                seen = image.over[y, x] if folded and k >= limits.far else image.near[y, x]
+                seen = image.over[y, x] if folded and k >= limits.above + limits.far else image.near[y, x]
                 bright = min(max((seen / highest - darker) / (as_bright - darker), 0.0), 1.0)
             above += bright * bright
     scale /= bones + (limits.own_sigma / limits.scale_sigma) ** 2
@@ -369,7 +283,13 @@ def _cost(
 
 @compiled
 def _open(
-    image: LedImage, gain: float, table: Postures, row: int, abduction: float, limits: _Limits, out: Float32
+    image: LedImage,
+    gain: float,
+    table: Postures,
+    row: int,
+    abduction: float,
+    limits: FingertipSettings,
+    out: Float32,
 ) -> None:
     """As `fingertips._open`, of one hypothesis."""
     uv, near, end = table.uv[row], table.near[row], limits.end
@@ -390,7 +310,7 @@ def _open(
 
 
 @compiled
-def _modes(found: _Found, count: int, table: Postures, limits: _Limits, out: Int) -> int:
+def _modes(found: _Found, count: int, table: Postures, limits: FingertipSettings, out: Int) -> int:
     """As `fingertips.modes`, of one finger: how many."""
     if count == 0:
         return 0
@@ -398,13 +318,13 @@ def _modes(found: _Found, count: int, table: Postures, limits: _Limits, out: Int
     good = np.flatnonzero(cost < cost.min() + limits.mode_within)
     number = 0
     for k in good[np.argsort(cost[good])]:
-        apart = True
+        separate = True
         for of in range(number):
             other = out[of]
             x, y = found.at[k, 0] - found.at[other, 0], found.at[k, 1] - found.at[other, 1]
-            far = limits.apart * table.end[int(found.row[other]), 0]
-            apart = apart and x * x + y * y >= far * far
-        if apart:
+            far = limits.separation * table.end[int(found.row[other]), 0]
+            separate = separate and x * x + y * y >= far * far
+        if separate:
             out[number] = k
             number += 1
             if number == limits.modes:
@@ -413,7 +333,7 @@ def _modes(found: _Found, count: int, table: Postures, limits: _Limits, out: Int
 
 
 @compiled
-def _fit(led: Image, circle: Float, open_: Float32, edges: _Outline) -> None:
+def _fit(led: Image, circle: Float, open_: Float32, edges: OutlineSettings) -> None:
     """As `led_image.fitted`, of one circle (x, y, radius, sigma, shown), in place."""
     directions = len(edges.way)
     off, firm, weight = np.empty(directions), np.zeros(directions), np.zeros(directions)
@@ -457,7 +377,7 @@ def _fit(led: Image, circle: Float, open_: Float32, edges: _Outline) -> None:
 
 @compiled
 def _edge(
-    led: Image, x: float, y: float, radius: float, way: Float, log: Float32, edges: _Outline
+    led: Image, x: float, y: float, radius: float, way: Float, log: Float32, edges: OutlineSettings
 ) -> tuple[float, float, bool]:
     """As `led_image._edges`, of one circle and direction."""
     height, width = led.shape
@@ -495,15 +415,17 @@ def _light(led: Image, u: float, v: float) -> int:
 
 
 @compiled
-def _apart(found: _Found, k: int, table: Postures, limits: _Limits, circle: Float) -> float:
-    """As `fingertips._apart`, of one hypothesis."""
+def _outline_cost(found: _Found, k: int, table: Postures, limits: FingertipSettings, circle: Float) -> float:
+    """As `fingertips._outline_cost`, of one hypothesis."""
     x, y, radius = circle[0] - found.at[k, 0], circle[1] - found.at[k, 1], circle[2]
     larger = math.log(table.end[int(found.row[k]), 0] / radius) / limits.size_sigma
     return (x * x + y * y) / (limits.at_sigma * radius) ** 2 + larger * larger
 
 
 @compiled
-def _ends(found: _Found, count: int, table: Postures, limits: _Limits, circle: Float, out: Float) -> None:
+def _ends(
+    found: _Found, count: int, table: Postures, limits: FingertipSettings, circle: Float, out: Float
+) -> None:
     """As `fingertips.Ends`, of one finger whose outline is that circle."""
     square = np.full(count, np.inf)
     within = found.cost[:count].min() + limits.ends_within
@@ -511,7 +433,7 @@ def _ends(found: _Found, count: int, table: Postures, limits: _Limits, circle: F
     least = np.inf
     for k in range(count):
         if found.cost[k] < within:
-            square[k] = found.cost[k] + _apart(found, k, table, limits, circle)
+            square[k] = found.cost[k] + _outline_cost(found, k, table, limits, circle)
             least = min(least, square[k])
     sure = (limits.at_sure + circle[3] / radius) ** -2
     total = ways = 0.0
@@ -538,7 +460,7 @@ def _ends(found: _Found, count: int, table: Postures, limits: _Limits, circle: F
 
 @compiled
 def _rotated(
-    found: _Found, k: int, table: Postures, limits: _Limits, u: float, v: float, sure: float
+    found: _Found, k: int, table: Postures, limits: FingertipSettings, u: float, v: float, sure: float
 ) -> tuple[float, float]:
     """As `fingertips._rotated`, of one hypothesis."""
     row, by = int(found.row[k]), found.abduction[k]

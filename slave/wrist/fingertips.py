@@ -8,18 +8,19 @@ outline, measured at full resolution (`led_image`), determines which it is and w
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import exp
 from typing import NamedTuple, Self, TypeAlias
 
 import cv2
 import numpy as np
 
-from common.arrays import Bool, Float, Image, Int
+from common.arrays import Bool, Float, Float32, Image, Int
 from slave.wrist.led_image import SETTINGS as OUTLINE
 from slave.wrist.led_image import (
     SHRINK,
     Circles,
-    Float32,
     WristView,
+    circle_of,
     depth_about,
     fitted,
     led_optics,
@@ -38,14 +39,13 @@ from slave.wrist.postures import (
     postures_of,
 )
 
-LEAST_NEAR = np.float32(1.5)  # roots of grey levels: noise
-
 
 class FingertipSettings(NamedTuple):
     """Numbers of the search for fingertips in the LED image."""
 
+    least_near: float = 1.5  # roots of grey levels: noise
     most_abduction: float = 1.7  # of the outer two of the table
-    # How far a posture may meet the laser from where it was seen: flesh is off its cones.
+    # How far a posture may meet the laser from where it was seen: skin is off its cones.
     within_m: float = 4e-3
     sigma_m: float = 2.5e-3
     # where no posture is as near as that
@@ -74,15 +74,13 @@ class FingertipSettings(NamedTuple):
     # Above a folded finger, the same: what is lit there may be an object that hides the rest of an extended one.
     folded_darker: float = 0.15
     folded_as_bright: float = 0.35
-    unknown_cost: float = (
-        1.0  # of a sample outside of the image, where that is saturated, or something hides it
-    )
+    unknown_cost: float = 1.0  # of a sample outside of the image, saturated, or hidden by something
     hidden: float = -0.6  # logarithm of nearness of what hides skin
     hides: float = 8.0  # cost of such a thing before a finger: the thumb is before all that a hand grips
     side: float = 0.35  # cosine between outline and hidden skin, seen from the end: no outline shows there
     modes: int = 8  # places of a finger whose outlines are looked at
     mode_within: float = 24.0  # what they may cost more than the best
-    apart: float = 0.4  # of the radius of a fingertip: places that differ
+    separation: float = 0.4  # of the radius of a fingertip: places that differ
     unseen_cost: float = 30.0  # what an outline that is not seen at all costs
     # of the radius: how far a posture's outline may be from the seen one
     at_sigma: float = 0.35
@@ -93,17 +91,24 @@ class FingertipSettings(NamedTuple):
     twist_sigma: float = 0.05  # rad: of the hinges of real fingers
     ends_within: float = 40.0  # of the best posture's cost: those whose ends are averaged
     correlated: float = 2.5  # samples that differ for one reason
-    # Standard deviations: edges; of the radius, how far flesh is off its cones, and where on its disk an end is
+    # Standard deviations: edges; of the radius, how far skin is off its cones, and where on its disk an end is
     # that faces the camera; and the residual at which they are twice as large.
     pixel: float = 0.7
     surface: float = 0.05
     pulp: float = 0.08
     cost_scale: float = 20.0
+    # What is of other modules or follows from the above: the cache of machine code only knows its arguments.
+    least_ratio: float = exp(-most_off)
+    most_ratio: float = exp(most_off)
+    end: int = END
+    bones: int = BONES.stop
+    highest: int = HIGHEST
+    above: int = ABOVE.start
+    apex: int = APEX
+    shrink: int = SHRINK
 
 
 SETTINGS = FingertipSettings()
-# Of an end that is reported; of the thumb, whose four angles are searched less finely, and of the fingers.
-LEAST_SHOWN = np.array([0.75, 0.6])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,10 +138,6 @@ class LedImage(NamedTuple):
         column = np.ones((rows, 1), np.uint8)
         over = cv2.dilate(near, column, anchor=(0, rows - 1), borderType=cv2.BORDER_REPLICATE)
         return cls(near, clipped, np.asarray(over, np.float32))
-
-    def above(self, uv: Float32) -> Float32:
-        """The most nearness above pixels (..., 2)."""
-        return self._replace(near=self.over).at(uv)[0]
 
     def at(self, uv: Float32) -> tuple[Float32, Bool, Bool]:
         """Nearness, bound and whether it is outside of the image, at pixels (..., 2)."""
@@ -241,7 +242,7 @@ def _at(parabola: Float32, share: Float32) -> Float32:
 
 def _logarithm(seen: Float32, predicted: Float32, bound: Bool) -> Float32:
     """Return the logarithm of seen over predicted nearness, 0 or more at a `bound`."""
-    off = np.log(np.maximum(seen, LEAST_NEAR) / np.maximum(predicted, np.float32(0.1)))
+    off = np.log(np.maximum(seen, SETTINGS.least_near) / np.maximum(predicted, np.float32(0.1)))
     np.maximum(off, 0.0, out=off, where=bound)
     return off
 
@@ -267,7 +268,8 @@ def costs(some: Hypotheses, image: LedImage, gain: float) -> Float32:
     # Above the finger.
     folded = some.table.open[some.rows, SETTINGS.upwards] == 0.0
     seen, bound, outside = seen[:, ABOVE], bound[:, ABOVE], outside[:, ABOVE]
-    seen[folded, SETTINGS.far :] = image.above(some.uv[folded, ABOVE][:, SETTINGS.far :])
+    over = image._replace(near=image.over)
+    seen[folded, SETTINGS.far :] = over.at(some.uv[folded, ABOVE][:, SETTINGS.far :])[0]
     darker, as_bright = (
         np.where(folded, np.float32(a), np.float32(b))[:, None]
         for a, b in (
@@ -290,41 +292,39 @@ def modes(some: Hypotheses, cost: Float32) -> Int:
     good = np.flatnonzero(more < SETTINGS.mode_within)
     order = good[np.argsort(more[good])]
     u, v = some.uv[order, END].T.tolist()
-    near = (SETTINGS.apart * some.table.end[some.rows[order], 0]).tolist()
+    near = (SETTINGS.separation * some.table.end[some.rows[order], 0]).tolist()
     out: list[int] = []
     kept: tuple[list[tuple[float, float, float]], ...] = ([], [], [], [], [])
     for k, finger, x, y, r in zip(order.tolist(), some.finger[order].tolist(), u, v, near, strict=True):
         others = kept[int(finger)]
         if len(others) == SETTINGS.modes:
             continue
-        if all((x - a) ** 2 + (y - b) ** 2 >= apart for a, b, apart in others):
+        if all((x - a) ** 2 + (y - b) ** 2 >= least for a, b, least in others):
             others.append((x, y, r * r))
             out.append(k)
     return np.array(out, np.int64)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Candidates:
-    """The best end of each of K fingers."""
+class Ends(NamedTuple):
+    """The most likely end of each of K fingers."""
 
     finger: Int  # (K,)
-    uv: Float  # (K, 2) [px]
-    sigma_px: Float  # (K,)
-    radius_px: Float  # (K,) of its outline
+    circle: Circles  # the outline about it
     residual: Float  # (K,) minus twice the logarithm of its likelihood, by samples and outline
-    shown: Float  # (K,) share of the outline that is seen
-    seen: Float  # (K,) probability that the finger itself leaves its end to be seen
+    towards: Float  # (K, 2) from the middle of the outline, in radii
+    spread: Float  # (K,) in radii
+    facing: Float  # (K,) how much it faces the camera
+    seen: Float  # (K,) probability that the finger itself leaves it to be seen
 
 
-Search: TypeAlias = Callable[[Image, LedImage, Float, WristView], Candidates | None]
+Search: TypeAlias = Callable[[Image, LedImage, Float, WristView], Ends | None]
 
 
-def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) -> Candidates | None:
+def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) -> Ends | None:
     """Most likely end of each finger whose laser point is known; None: of none."""
     laser_m = view.on_plane(laser_uv)
     gain = light_scale(image, laser_uv, laser_m)
-    some = hypotheses(laser_m, image, gain, view) if gain is not None else None
-    if gain is None or some is None:
+    if gain is None or (some := hypotheses(laser_m, image, gain, view)) is None:
         return None
     cost = costs(some, image, gain)
     best = modes(some, cost)
@@ -333,11 +333,11 @@ def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) ->
     circle = fitted(led, some.uv[best, END], some.table.end[rows, 0], outline)
     circle = fitted(led, circle.middle, circle.radius, outline)
     residual = cost[best] + SETTINGS.unseen_cost * (1.0 - circle.shown)
-    residual += _apart(some.uv[best, END], some.table.end[rows, 0], circle.middle, circle.radius)
+    residual += _outline_cost(some.uv[best, END], some.table.end[rows, 0], circle.middle, circle.radius)
     order = np.lexsort((residual, finger))
     chosen = order[np.append(True, finger[order[1:]] != finger[order[:-1]])]
-    circle, residual, finger = Circles(*(each[chosen] for each in circle)), residual[chosen], finger[chosen]
-    return reported(finger, circle, residual, _ends(some, cost, finger, circle))
+    circle, finger = Circles(*(each[chosen] for each in circle)), finger[chosen]
+    return Ends(finger, circle, residual[chosen], *_mean_ends(some, cost, finger, circle))
 
 
 def _open(some: Hypotheses, which: Int, image: LedImage, gain: float) -> Float32:
@@ -346,46 +346,22 @@ def _open(some: Hypotheses, which: Int, image: LedImage, gain: float) -> Float32
     seen, bound, outside = image.at(uv[:, BONES])
     off = _logarithm(seen, some.table.near[some.rows[which], BONES] * np.float32(gain), bound)
     hidden = (off < SETTINGS.hidden) & ~bound & ~outside
-    angle = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
     way = uv[:, BONES] - uv[:, END, None]
-    along = way @ np.stack([np.cos(angle), np.sin(angle)])
+    along = way @ circle_of(DIRECTIONS).T
     towards = hidden[..., None] & (along > SETTINGS.side * np.linalg.norm(way, axis=-1)[..., None])
     return np.where(towards.any(axis=1), np.float32(0.0), open_)
 
 
-def _apart(at: Float32, size: Float32, middle: Float, radius: Float) -> Float:
+def _outline_cost(at: Float32, size: Float32, middle: Float, radius: Float) -> Float:
     """Return the cost of circles (N, 2), (N,) [px] that differ from the postures."""
     off = (middle - at) / (SETTINGS.at_sigma * radius)[:, None]
     return np.vecdot(off, off) + (np.log(size / radius) * (1.0 / SETTINGS.size_sigma)) ** 2
 
 
-class Ends(NamedTuple):
-    """Fingertip ends of K fingers."""
-
-    towards: Float  # (K, 2) from the middle of the outline, in radii
-    spread: Float  # (K,) in radii
-    facing: Float  # (K,) how much it faces the camera
-    seen: Float  # (K,) how likely the finger leaves it to be seen
-
-
-def reported(finger: Int, circle: Circles, residual: Float, ends: Ends) -> Candidates:
-    """Ends of K fingers, by the circles about them."""
-    radius = circle.radius
-    of_spread = 0.6  # postures that are possible differ by more than the mean of them is off
-    surface = radius * np.sqrt(
-        SETTINGS.surface**2
-        + (SETTINGS.pulp * np.maximum(ends.facing, 0.0)) ** 2
-        + (of_spread * ends.spread) ** 2
-    )
-    sigma = np.sqrt(SETTINGS.pixel**2 + surface**2 + circle.sigma_px**2) * (
-        1.0 + residual / SETTINGS.cost_scale
-    )
-    at = circle.middle + ends.towards * radius[:, None]
-    return Candidates(finger, at, sigma, radius, residual, circle.shown, ends.seen)
-
-
-def _ends(some: Hypotheses, cost: Float32, finger: Int, circle: Circles) -> Ends:
-    """Return the mean ends of each finger (K,) by likelihood, given its circle."""
+def _mean_ends(
+    some: Hypotheses, cost: Float32, finger: Int, circle: Circles
+) -> tuple[Float, Float, Float, Float]:
+    """The last four of `Ends`: means by likelihood, given the circles."""
     least = np.full(5, np.inf)
     first = np.flatnonzero(np.diff(some.finger, prepend=-1))
     least[some.finger[first]] = np.minimum.reduceat(cost, first)
@@ -394,7 +370,7 @@ def _ends(some: Hypotheses, cost: Float32, finger: Int, circle: Circles) -> Ends
     row[finger] = np.arange(len(finger))
     of = row[some.finger[near]]
     end, uv, radius = some.table.end[some.rows[near]], some.uv[near], circle.radius[of]
-    square = cost[near] + _apart(uv[:, END], end[:, 0], circle.middle[of], radius)
+    square = cost[near] + _outline_cost(uv[:, END], end[:, 0], circle.middle[of], radius)
     sigma = SETTINGS.at_sure + circle.sigma_px / circle.radius
     first = np.searchsorted(of, np.arange(len(finger)))
     weight = np.exp((np.minimum.reduceat(square, first)[of] - square) * (0.5 / SETTINGS.correlated))
@@ -407,7 +383,7 @@ def _ends(some: Hypotheses, cost: Float32, finger: Int, circle: Circles) -> Ends
     sums = np.add.reduceat(what * weight[:, None], first)
     mean = sums[:, 1:] / sums[:, :1]
     variance = mean[:, 2] - mean[:, 0] ** 2 - mean[:, 1] ** 2
-    return Ends(mean[:, :2], np.sqrt(np.maximum(0.5 * variance, 0.0)), mean[:, 3], mean[:, 4])
+    return mean[:, :2], np.sqrt(np.maximum(0.5 * variance, 0.0)), mean[:, 3], mean[:, 4]
 
 
 def _rotated(some: Hypotheses, which: Int, off: Float, sigma: Float) -> Float:
@@ -442,7 +418,7 @@ def light_scale(image: LedImage, laser_uv: Float, laser_m: Float) -> float | Non
     """Nearness at 1 m facing the camera [grey levels^0.5], by laser points, or None."""
     known = np.isfinite(laser_m[:, 0])
     near, clipped, outside = image.at(laser_uv[known].astype(np.float32))
-    good = ~clipped & ~outside & (near > LEAST_NEAR)
+    good = ~clipped & ~outside & (near > SETTINGS.least_near)
     if not good.any():
         return None
     distance = np.sqrt((laser_m[known][good] ** 2).sum(axis=1))
@@ -459,21 +435,32 @@ def fingertips(
     `laser_uv`: (5, 2) where the laser meets the fingers [px], NaN: not seen, then no tip is sought; `view`: the wrist
     is straight.
     """
-    out = Fingertips(np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan))
     optics = led_optics(view)
     near = nearness(shrink(led), optics)
     clipped = 247  # grey levels of the LED frame, from which a sample may be brighter than it looks
     image = LedImage.of(near, frame[1::SHRINK, 1::SHRINK] > clipped)
-    found = search(led, image, laser_uv, view)
-    if found is None:
-        return out
-    kind = np.minimum(found.finger, 1)
+    ends = search(led, image, laser_uv, view)
+    if ends is None:
+        return NO_TIPS
+    circle, residual = ends.circle, ends.residual
+    uv = circle.middle + ends.towards * circle.radius[:, None]
+    of_spread = 0.6  # postures that are possible differ by more than the mean of them is off
+    surface = circle.radius * np.sqrt(
+        SETTINGS.surface**2
+        + (SETTINGS.pulp * np.maximum(ends.facing, 0.0)) ** 2
+        + (of_spread * ends.spread) ** 2
+    )
+    sigma = np.sqrt(SETTINGS.pixel**2 + surface**2 + circle.sigma_px**2) * (
+        1.0 + residual / SETTINGS.cost_scale
+    )
+    least_shown = np.where(ends.finger == 0, 0.75, 0.6)  # the thumb's four angles are searched less finely
     most_residual, likely = 32.0, 0.4  # of one that is less likely to be seen in proportion
-    most = most_residual * np.minimum(found.seen / likely, 1.0)
-    good = (found.shown > LEAST_SHOWN[kind]) & (found.residual < most)
+    good = (circle.shown > least_shown) & (residual < most_residual * np.minimum(ends.seen / likely, 1.0))
+    out = Fingertips(np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan))
     for k in np.flatnonzero(good).tolist():
-        finger, at = int(found.finger[k]), found.uv[k]
-        depth = depth_about(near, optics, float(at[0]), float(at[1]), float(found.radius_px[k]))
+        finger = int(ends.finger[k])
+        u, v = map(float, uv[k])
+        depth = depth_about(near, optics, u, v, float(circle.radius[k]))
         if np.isfinite(depth):
-            out.uv[finger], out.sigma_px[finger], out.depth[finger] = at, found.sigma_px[k], depth
+            out.uv[finger], out.sigma_px[finger], out.depth[finger] = uv[k], sigma[k], depth
     return out

@@ -6,7 +6,7 @@ brighter neighbours; of paths alike the one nearer to the middle of its band is 
 
 The laser's line is short bright runs in the image's columns (`runs`). Seams assign a line; where they cut one, the
 cut moves to the crease. A pixel of the laser's plane is a known place before the palm, and fingers lean little to the
-side, so a line lies nearest to the axis of its own finger (`LaserWorkspace.place`). A wrist that deviates by 5
+side, so a line lies nearest to the axis of its own finger (`Palm.place`). A wrist that deviates by 5
 degrees moves all by half a finger; where four lines lie side by side their middle is between the second and the
 third. The thumb crosses the plane near its MCP or beside the palm: what lies as near to its root is its own.
 
@@ -21,13 +21,13 @@ from typing import cast
 import cv2
 import numpy as np
 
-from common.arrays import Bool, Float, Image, Int
+from common.arrays import Bool, Float, Float32, Image, Int
 from slave.wrist.engine import NUMPY, Engine
 from slave.wrist.led_image import WristView
 from slave.wrist.palm_pose import PalmPose, find_palm_pose
-from slave.wrist.runs import NONE, SETTINGS, FingerLines, Runs
-from slave.wrist.seams import DARK, STARTS, STATION_PX, WIDTHS, Float32, SearchBands, search_bands_of
-from slave.wrist.workspace import LaserWorkspace, workspace_of
+from slave.wrist.runs import NONE, SETTINGS, Runs
+from slave.wrist.seams import DARK, STARTS, WIDTHS, SearchBands, search_bands_of
+from slave.wrist.workspace import workspace_of
 
 _TAKEN = 10.0  # energy for the thumb's seam where another seam runs
 _HALF_WIDTH = 3.0  # samples of the thumb's search band: half the breadth of such a minimum
@@ -52,14 +52,13 @@ class Fingers:
 
     def finger_of(self, uv: Float) -> Int:
         """Finger (N,), 0 thumb ... 4 little, of pixels (N, 2); -1 where the pixel is NaN."""
-        search_bands = self.search_bands
-        radius, angle = search_bands.polar(uv)
-        steps: Float = STATION_PX * np.arange(self.seams.shape[1], dtype=np.float64)
+        bands = self.search_bands
+        radius, angle = bands.polar(uv)
         finger: Int = np.ones(len(uv), dtype=np.int64)
-        across: list[Float] = [np.interp(uv[:, 1], search_bands.row + steps, seam) for seam in self.seams[:3]]
-        for seam in across:
-            finger += search_bands.thumb_side * (seam - uv[:, 0]) > 0.0
-        finger[angle > np.interp(radius, search_bands.radius + steps, self.seams[3])] = 0
+        for seam in self.seams[:3]:
+            at = np.asarray(np.interp(uv[:, 1], bands.rows, seam), np.float64)
+            finger += bands.thumb_side * (at - uv[:, 0]) > 0.0
+        finger[angle > np.interp(radius, bands.radii, self.seams[3])] = 0
         finger[np.isnan(radius)] = NONE
         return finger
 
@@ -72,12 +71,8 @@ def separate(led: Image, view: WristView, engine: Engine = NUMPY) -> Fingers:
     palm = dark[search_bands.palm[:, 1], search_bands.palm[:, 0]] if len(search_bands.palm) else dark
     # grey levels that the palm of a lit hand exceeds, or what hides it; the sun leaves less
     shown = bool(2 * np.count_nonzero(palm > 24) > palm.size)
-    straightened = cast(
-        Image,
-        cv2.remap(
-            dark, search_bands.map_x, search_bands.map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        ),
-    )
+    where = search_bands.map_x, search_bands.map_y
+    straightened = cast(Image, cv2.remap(dark, *where, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
     energy = engine.energy(straightened, search_bands.thumb_crosses)
     energy[:, : STARTS[3]] *= search_bands.weight
     paths = engine.minimum_cost_paths(energy, WIDTHS)
@@ -122,17 +117,15 @@ def _part(
 
 def _in_thumbs(search_bands: SearchBands, seams: Float) -> Float:
     """Return the sample (3, S) of the thumb's search band that each seam crosses."""
-    count = seams.shape[1]
-    steps = STATION_PX * np.arange(count, dtype=np.float64)
-    rows = np.broadcast_to(search_bands.row + steps, seams.shape)
+    rows = np.broadcast_to(search_bands.rows, seams.shape)
     radius, angle = search_bands.polar(np.stack([seams.ravel(), rows.ravel()], axis=-1))
     upward = radius.reshape(seams.shape)[:, ::-1], angle.reshape(seams.shape)[:, ::-1]
-    circles = search_bands.radius + steps
-    on_circles: list[Float] = [np.interp(circles, r, a) for r, a in zip(*upward, strict=True)]
+    rows_upward: list[tuple[Float, Float]] = list(zip(*upward, strict=True))
+    on_circles: list[Float] = [np.interp(search_bands.radii, r, a) for r, a in rows_upward]
     return search_bands.sample(3, np.array(on_circles))
 
 
-# Where `LaserWorkspace.place` is a finger's, thumb ... little: half a spacing, and the palm's error. Folded
+# Where `Palm.place` is a finger's, thumb ... little: half a spacing, and the palm's error. Folded
 # fingers point to the root of the thumb, the little one a quarter of a spacing towards it.
 _FROM: Float = np.array([-np.inf, -np.inf, 1.35, 2.3, 3.1])
 _TO: Float = np.array([np.inf, 1.65, 2.65, 3.65, np.inf])
@@ -140,13 +133,18 @@ _ALL = (3.2, 4.4)  # place: from the outside of the index to that of the little 
 _ASIDE = (0.3, 0.7)  # place: by less it is folded fingers; farther the palm has not turned unseen
 
 
-def finger_labels(finger: Int, runs: Runs, points: Float, workspace: LaserWorkspace) -> Int:
-    """Fingers (N,) of runs at pixels (N, 2), from the labels (N,) of the seams."""
-    beyond, place = workspace.on_plane(points)
-    on = finger != NONE
-    near = on & workspace.only_thumb(beyond, place)
+# Beyond the skin over the thumb's MCP, from its root. A thumb that is bent before the palm meets the plane at its MCP,
+# half a centimetre either way as device and bones are known; a finger folded to the palm does so a centimetre beyond.
+_THUMBS_M, _NO_THUMBS_M = 4e-3, 10e-3
+
+
+def finger_labels(finger: Int, runs: Runs, beyond: Float, place: Float, *, flexed: bool) -> Int:
+    """Fingers (N,) of runs, from the labels (N,) of the seams.
+
+    `beyond`: `Palm.beyond_m` (N,) [m]; `place`: `Palm.place` (N,); `flexed`: whether the wrist is.
+    """
     thumb, index = 0, 1
-    out = np.where(near, thumb, finger)
+    out = np.where((finger != NONE) & (beyond < _THUMBS_M) & (place < 1.5), thumb, finger)
     place = place - _shift(place[out > thumb])
     out = _at_creases(out, runs)
     ends = out[1:] != out[:-1]
@@ -156,12 +154,16 @@ def finger_labels(finger: Int, runs: Runs, points: Float, workspace: LaserWorksp
     middle = np.add.reduceat(place, first) / count
     of = out[first]
     nearest = np.clip(np.rint(middle), 1, 4).astype(np.int64)
-    no_thumb = (of == thumb) & workspace.no_thumb(np.add.reduceat(beyond, first) / count, middle)
+    outside_index = (
+        0.5  # place: beyond the palm; there is the thumb of a bent wrist where the index is in its own
+    )
+    no_thumb = (
+        (of == thumb) & (np.add.reduceat(beyond, first) / count > _NO_THUMBS_M) & (middle > outside_index)
+    )
     aside = (of > thumb) & ((middle < _FROM[of]) | (middle > _TO[of]))
     aside &= _room(of, nearest, aside | no_thumb)
     of = np.where(no_thumb | aside, nearest, of)
-    if workspace.flexed:
-        outside_index = 0.5  # place: there is the thumb of a bent wrist where the index is in its own
+    if flexed:
         beyond_index = (of == index) & (middle < outside_index)
         if ((of == index) & ~beyond_index).any():
             of = np.where(beyond_index, thumb, of)
@@ -232,15 +234,6 @@ _T3 = np.array([-2.23, -1.15, -0.66, -0.31, 0.0, 0.31, 0.66, 1.15, 2.23])
 _BORDERS_M: Float = _BORDER_M + _BORDER_SIGMA_M * _T3
 
 
-def on_ball(beyond_m: Float) -> bool:
-    """Return whether a line (N,) is rather on the ball than on the thumb.
-
-    The line is so far beyond the MCP's skin [m]. Where the wrist is straight the thumb stands across the plane; a
-    bent one can bring the ball there alone.
-    """
-    return float(np.median(beyond_m)) < _BORDER_M
-
-
 def beyond_ball(runs: Runs, of_thumb: Int, beyond_m: Float) -> tuple[Float, float]:
     """Centroid offset (2,) of the thumb's part of a line, and its deviation [px].
 
@@ -259,9 +252,7 @@ def beyond_ball(runs: Runs, of_thumb: Int, beyond_m: Float) -> tuple[Float, floa
     seen = total >= least_px
     # Sums, not products of matrices, and no hypot: they are the same bits on every processor.
     whole = (length[:, None] * points).sum(axis=0) / length.sum()
-    if (
-        not seen.any()
-    ):  # all of it on the ball: nearest to the thumb is where it is seen farthest from the root
+    if not seen.any():  # all of it on the ball: the thumb is nearest to what is farthest from the root
         return points[int(beyond_m.argmax())] - whole, float(np.ptp(points[:, 0]))
     off = (weights[seen, :, None] * points).sum(axis=1) / total[seen, None] - whole
     mean = off.mean(axis=0)
@@ -287,42 +278,42 @@ class LaserLines:
 
 def laser_lines(laser: Image, fingers: Fingers, view: WristView, engine: Engine = NUMPY) -> LaserLines:
     """Find the segments in the difference of laser and ambient frame."""
-    workspace = workspace_of(fingers.palm_pose.view).at_palm_pose(fingers.palm_pose)
+    pose, flexed = fingers.palm_pose, not fingers.palm_pose.straight
+    workspace = workspace_of(pose.view)
     runs, on_line = engine.lines(laser, workspace.first_row)
     if not len(runs.row):
         return LaserLines(np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan))
     points: Float = np.stack([runs.column, runs.row], axis=-1, dtype=np.float64)
     finger = fingers.finger_of(points)
     finger[~on_line] = NONE
-    finger = finger_labels(finger, runs, points, workspace)
-    finger[~workspace.holds(finger, points)] = NONE
-    finger[workspace.on_palm(points)] = NONE
+    palm, palm_points = workspace.palm, workspace.before_palm(points, pose.T_camera_palm)
+    beyond, place = palm.beyond_m(palm_points), palm.place(palm_points)
+    finger = finger_labels(finger, runs, beyond, place, flexed=flexed)
+    ball_m = -3e-3  # nearer there is no finger but the thumb
+    finger[~(workspace.holds(finger, points) & ((finger == 0) | (beyond > ball_m)))] = NONE
+    if flexed:  # then the palm may come into the plane
+        finger[palm.surface(palm_points, place)] = NONE
     finger_lines = engine.measure(runs, finger, view.optics.width_px)
     uv, length = finger_lines.uv, finger_lines.line
     least_m = 2e-3  # of line that must be seen
     seen = length * workspace.metres_per_px(uv) >= least_m
-    sigma = _sigma_px(finger_lines, shown=fingers.shown)
+    # at least, of a line in parts, some of which may be another's, or of one cut by the image
+    in_parts_px = 2.0
+    in_parts = np.where(
+        np.isnan(finger_lines.split_px),
+        np.where(finger_lines.cut, in_parts_px, 0.0),
+        np.fmax(finger_lines.split_px, in_parts_px),
+    )
+    in_parts = np.where(finger_lines.brightest < _FAINT, np.maximum(_FAINT_PX, in_parts), in_parts)
+    unshown_px = 0.0 if fingers.shown else 4.0  # no seam was seen
+    sigma = np.sqrt(_LINE_PX**2 + in_parts**2 + unshown_px**2)
     if seen[0]:
         thumb = np.flatnonzero(finger == 0)
-        beyond = workspace.beyond_m(points[thumb])
-        off, extra_sigma = beyond_ball(runs, thumb, beyond)
-        seen[0] = not (workspace.flexed and on_ball(beyond))
+        off, extra_sigma = beyond_ball(runs, thumb, beyond[thumb])
+        # Where the wrist is straight the thumb stands across the plane; a bent one can bring the ball there alone.
+        seen[0] = not (flexed and float(np.median(beyond[thumb])) < _BORDER_M)
         uv[0] += off
         thumb_px = 1.5  # at least, of the thumb: its line runs into that of its ball
         sigma[0] = np.hypot(np.hypot(sigma[0], extra_sigma), thumb_px)
     uv[~seen], sigma[~seen], length[~seen] = np.nan, np.nan, np.nan
     return LaserLines(uv, sigma, length)
-
-
-def _sigma_px(finger_lines: FingerLines, *, shown: bool) -> Float:
-    """Standard deviations (5,) of centroids; parts of a line may be another's."""
-    apart = finger_lines.apart
-    # at least, of a line in parts, some of which may be another's, or of one cut by the image
-    in_parts_px = 2.0
-    in_parts = np.where(
-        np.isnan(apart), np.where(finger_lines.cut, in_parts_px, 0.0), np.fmax(apart, in_parts_px)
-    )
-    in_parts = np.where(finger_lines.brightest < _FAINT, np.maximum(_FAINT_PX, in_parts), in_parts)
-    unshown_px = 4.0  # no seam was seen
-    unshown = 0.0 if shown else unshown_px
-    return np.sqrt(_LINE_PX**2 + in_parts**2 + unshown**2)

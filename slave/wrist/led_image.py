@@ -16,15 +16,15 @@ proportion. The circle fits the edges by least squares, given what was predicted
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple, TypeAlias, cast
+from typing import NamedTuple, cast
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from common.arrays import Bool, Float, Image, Int
+from common.arrays import Bool, Float, Float32, Image, Int
 from common.calibration import CameraCalibration, HandProfile, RigCalibration
 from common.calibration.rig import FlatField, flat_of
+from common.errors import CalibrationError
 from common.hand.model import CHAINS, HandModel
 from common.hand.wrist import WristDevice
 
@@ -33,22 +33,14 @@ from common.hand.wrist import WristDevice
 class WristView(WristDevice):
     """A wrist rig, its camera and its hand, checked."""
 
-    led_m: Float  # LEDs (L, 3) [m]; none known: (0, 3)
     flat_field: FlatField | None  # what the LEDs make of a white surface, where it was measured
 
     @classmethod
     def of(cls, rig: RigCalibration, camera: CameraCalibration, hand: HandProfile) -> "WristView":
         """Bring the three files together; CalibrationError as `WristDevice.joined`."""
         device = WristDevice.joined(rig, camera, HandModel.of(hand))
-        return cls(
-            optics=device.optics,
-            model=device.model,
-            T_camera_palm=device.T_camera_palm,
-            normal=device.normal,
-            offset_m=device.offset_m,
-            led_m=np.array(rig.led or (), dtype=np.float64).reshape(-1, 3),
-            flat_field=rig.flat_field,
-        )
+        palm, plane = device.T_camera_palm, (device.normal, device.offset_m)
+        return cls(device.optics, device.model, palm, *plane, rig.flat_field)
 
 
 PER_BONE = 6  # points along each bone
@@ -57,27 +49,24 @@ NEAREST_M = 0.03  # what is nearer to the camera is not seen as a finger
 
 def finger_postures(view: WristView, *counts: int) -> Float:
     """Postures (P, 5, 4) [rad] of so many abductions, flexions, PIP flexions."""
-    low, high = view.model.limits_rad[1].T
-    out = _all(*[_spread(low[k], high[k], n) for k, n in enumerate(counts)], np.zeros(1))
+    out = _grid(view.model.limits_rad[1], *counts, 1)
     dip_per_pip = 0.84  # of natural flexion (Kim et al. 2012)
-    pip, dip = 2, 3
-    out[..., dip] = dip_per_pip * out[..., pip]
+    out[..., 3] = dip_per_pip * out[..., 2]
     return out
 
 
 def thumb_postures(view: WristView, *counts: int) -> Float:
     """Postures (P, 5, 4) [rad] of the thumb, so many of each of its four angles."""
-    low, high = view.model.limits_rad[0].T
-    return _all(*(_spread(low[k], high[k], n) for k, n in enumerate(counts)))
+    return _grid(view.model.limits_rad[0], *counts)
 
 
-def _spread(low: float, high: float, count: int) -> Float:
-    """So many values (count,) from low to high; a single one is 0."""
-    return np.linspace(low, high, count, dtype=np.float64) if count > 1 else np.zeros(1)
-
-
-def _all(*values: Float) -> Float:
-    """Return all combinations (P, 5, 4) of values of the four angles [rad]."""
+def _grid(limits_rad: Float, *counts: int) -> Float:
+    """All combinations (P, 5, 4) of so many values within limits (4, 2); one is 0."""
+    ends: list[Float] = list(limits_rad)
+    values: list[Float] = [
+        np.linspace(low_high[0], low_high[1], count) if count > 1 else np.zeros(1)
+        for low_high, count in zip(ends, counts, strict=True)
+    ]
     grid = np.stack(np.meshgrid(*values, indexing="ij"), axis=-1).reshape(-1, 1, 4)
     return np.broadcast_to(grid, (len(grid), 5, 4)).copy()
 
@@ -99,6 +88,13 @@ def _between(ends: Float) -> Float:
     return ends[..., :-1, :, :] * (1.0 - share) + ends[..., 1:, :, :] * share
 
 
+def unseen(part: str) -> CalibrationError:
+    """The error of a palm pose with which fingers or thumb are outside of the image."""
+    return CalibrationError(
+        f"T_camera_palm: the camera does not see the {part} of this hand; calibrate the palm's pose"
+    )
+
+
 def in_image(view: WristView, palm_m: Float) -> tuple[Float, Float]:
     """Pixels and depths [m] of palm points (..., 3); what is too near is held off."""
     camera = palm_m @ view.T_camera_palm[:3, :3].T + view.T_camera_palm[:3, 3]
@@ -106,8 +102,6 @@ def in_image(view: WristView, palm_m: Float) -> tuple[Float, Float]:
     held = np.concatenate([camera[..., :2], np.maximum(depth, NEAREST_M)[..., None]], axis=-1)
     return view.optics.project(held), depth
 
-
-Float32: TypeAlias = npt.NDArray[np.float32]
 
 SHRINK = 4  # the LED image is read at a quarter of its resolution
 
@@ -118,7 +112,6 @@ class LedOptics:
 
     cosine: Float32  # (h, w) of the angle off the optical axis
     level: Float32  # (h, w) 1 / sqrt(F)
-    ray: Float32  # (h, w, 3) of depth 1 along the optical axis
 
 
 def shrink(led: Image) -> Float32:
@@ -130,8 +123,8 @@ def shrink(led: Image) -> Float32:
 
 
 def nearness(grey: Float32, optics: LedOptics) -> Float32:
-    """Nearness sqrt(I / F) (h, w) of the top h rows' grey levels >= 0; NaN of NaN."""
-    return np.sqrt(grey) * optics.level[: len(grey)]
+    """Nearness sqrt(I / F) (h, w) of grey levels >= 0."""
+    return np.sqrt(grey) * optics.level
 
 
 def depth_about(near: Float32, optics: LedOptics, u: float, v: float, radius_px: float) -> float:
@@ -142,28 +135,29 @@ def depth_about(near: Float32, optics: LedOptics, u: float, v: float, radius_px:
     row, column, reach = round(v / SHRINK), round(u / SHRINK), max(round(radius_px / SHRINK), 1)
     about = (slice(max(row - reach, 0), row + reach + 1), slice(max(column - reach, 0), column + reach + 1))
     dark = 4.0  # grey levels: what the noise of a difference of two frames leaves
-    lit = near[about] > np.sqrt(dark) * optics.level[: len(near)][about]
-    depth = optics.cosine[: len(near)][about][lit] / near[about][lit]
-    return float(depth.min()) if len(depth) else float("nan")
-
-
-def _centres(size_px: int) -> Float:
-    """Pixels of the image at the centres of the shrunken image's rows or columns."""
-    return np.arange(size_px // SHRINK, dtype=np.float64) * SHRINK + 0.5 * (SHRINK - 1)
+    lit = near[about] > np.sqrt(dark) * optics.level[about]
+    return float((optics.cosine[about][lit] / near[about][lit]).min()) if lit.any() else np.nan
 
 
 @lru_cache(maxsize=8)
 def led_optics(view: WristView) -> LedOptics:
     """The maps of one wrist rig; made once."""
-    u, v = _centres(view.optics.width_px), _centres(view.optics.height_px)
+    u, v = (
+        np.arange(size // SHRINK, dtype=np.float64) * SHRINK + 0.5 * (SHRINK - 1)  # centres of cells
+        for size in (view.optics.width_px, view.optics.height_px)
+    )
     xy = view.optics.undistort(np.stack(np.meshgrid(u, v), axis=-1))
     ray = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=-1)
     flat = np.ones(xy.shape[:2]) if view.flat_field is None else flat_of(view.flat_field, xy)
     return LedOptics(
-        (1.0 / np.linalg.norm(ray, axis=-1)).astype(np.float32),
-        (1.0 / np.sqrt(flat)).astype(np.float32),
-        ray.astype(np.float32),
+        (1.0 / np.linalg.norm(ray, axis=-1)).astype(np.float32), (1.0 / np.sqrt(flat)).astype(np.float32)
     )
+
+
+def circle_of(directions: int) -> Float:
+    """Unit vectors (directions, 2) in the image, from the right clockwise."""
+    angle = np.arange(directions) * (2.0 * np.pi / directions)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 class OutlineSettings(NamedTuple):
@@ -184,23 +178,23 @@ class OutlineSettings(NamedTuple):
     middle_sigma: float = 0.6
     radius_sigma: float = 0.12
     edge_sigma: float = 0.08  # of the radius: how far skin is off a circle
+    widths: tuple[float, float, float] = (0.45, 0.25, 0.18)  # of the radius: beyond that an edge counts less
+    # Tables by those numbers: of grey levels, of directions, and of steps along a ray.
+    log: Float32 = np.log(np.arange(256, dtype=np.float32) + 6.0).astype(np.float32)  # and what is dark
+    way: Float = circle_of(directions)
+    share: Float32 = np.linspace(first, last, steps).astype(np.float32)
+    middles: Float32 = 0.5 * (share[width:] + share[:-width])
+    weight: Float32 = np.exp(-0.5 * ((middles - 1.0) / expected) ** 2).astype(np.float32)
+    step: float = float(share[1] - share[0])
 
 
 SETTINGS = OutlineSettings()
-LOG = np.log(np.arange(256, dtype=np.float32) + 6.0).astype(np.float32)  # of grey levels and what is dark
-WIDTHS = 0.45, 0.25, 0.18  # of the radius: beyond that an edge counts less
-_ANGLES = np.arange(SETTINGS.directions) * (2.0 * np.pi / SETTINGS.directions)
-WAY: Float = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
-_DESIGN = np.concatenate([WAY, np.ones((SETTINGS.directions, 1))], axis=1)
+_DESIGN = np.concatenate([SETTINGS.way, np.ones((SETTINGS.directions, 1))], axis=1)
 _PRODUCTS = (_DESIGN[:, :, None] * _DESIGN[:, None]).reshape(SETTINGS.directions, 9)
 _PRIOR_NORMAL = np.diag(
     SETTINGS.edge_sigma**2
     / np.array([SETTINGS.middle_sigma, SETTINGS.middle_sigma, SETTINGS.radius_sigma]) ** 2
 )
-SHARE = np.linspace(SETTINGS.first, SETTINGS.last, SETTINGS.steps).astype(np.float32)
-MIDDLES = 0.5 * (SHARE[SETTINGS.width :] + SHARE[: -SETTINGS.width])
-WEIGHT = np.exp(-0.5 * ((MIDDLES - 1.0) / SETTINGS.expected) ** 2).astype(np.float32)
-STEP = float(SHARE[1] - SHARE[0])
 
 
 class Circles(NamedTuple):
@@ -225,7 +219,7 @@ def fitted(led: Image, middle: Float | Float32, radius: Float | Float32, open_: 
     )
     weight: Float = firm
     solution, rest, normal = np.zeros((len(radius), 3)), off, np.broadcast_to(np.eye(3), (len(radius), 3, 3))
-    for width in WIDTHS:
+    for width in SETTINGS.widths:
         normal = (weight @ _PRODUCTS).reshape(-1, 3, 3) + _PRIOR_NORMAL
         solution = np.asarray(
             np.linalg.solve(normal, ((weight * off) @ _DESIGN)[..., None])[..., 0], np.float64
@@ -244,24 +238,23 @@ def _edges(led: Image, middle: Float, radius: Float) -> tuple[Float, Float, Bool
     Returns how far beyond the circle the edge is (N, DIRECTIONS), in radii; by how much the logarithm of light falls
     there; and whether the image shows that far.
     """
-    reach = radius[:, None, None].astype(np.float32) * SHARE
+    reach = radius[:, None, None].astype(np.float32) * SETTINGS.share
     x, y = (
-        middle[:, k, None, None].astype(np.float32) + reach * WAY[:, k, None].astype(np.float32)
+        middle[:, k, None, None].astype(np.float32) + reach * SETTINGS.way[:, k, None].astype(np.float32)
         for k in (0, 1)
     )
     height, width = led.shape
     inside: Bool = (x[..., -1] > 0) & (y[..., -1] > 0) & (x[..., -1] < width - 1) & (y[..., -1] < height - 1)
     along = x.reshape(-1, SETTINGS.steps), y.reshape(-1, SETTINGS.steps)
     light = cv2.remap(led, *along, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    log: Float32 = LOG[np.asarray(light, np.uint8)]
+    log: Float32 = SETTINGS.log[np.asarray(light, np.uint8)]
     drop = log[:, : -SETTINGS.width] - log[:, SETTINGS.width :]
-    best: Int = (drop * WEIGHT).argmax(axis=1)
+    best: Int = (drop * SETTINGS.weight).argmax(axis=1)
     steps, flat = drop.shape[1], drop.ravel()
     at = best + np.arange(len(best), dtype=np.int64) * steps
     # The parabola through the steepest step and its neighbours.
     before, here, behind = flat[at - (best > 0)], flat[at], flat[at + (best < steps - 1)]
     part = 0.5 * (behind - before) / np.maximum(2.0 * here - before - behind, SETTINGS.tiny)
-    off: Float = (
-        SETTINGS.rim - 1.0 + MIDDLES[best] + STEP * np.minimum(np.maximum(part, -0.5), 0.5).astype(np.float64)
-    )
+    part = np.minimum(np.maximum(part, -0.5), 0.5).astype(np.float64)
+    off: Float = SETTINGS.rim - 1.0 + SETTINGS.middles[best] + SETTINGS.step * part
     return off.reshape(inside.shape), here.reshape(inside.shape).astype(np.float64), inside

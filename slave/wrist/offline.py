@@ -17,10 +17,10 @@ from common.errors import CalibrationError, RecordingError
 from common.messages import WristDetections
 from common.recording.frame_recording import FrameRecording, Illumination, open_recording
 from slave.cameras.replay import read_png
+from slave.lights.controller import CYCLE
 from slave.sources import Frame
 from slave.wrist.detector import WristDetector
 from slave.wrist.led_image import WristView
-from slave.wrist.strobe import StrobeCycle
 
 _LOG = logging.getLogger(__name__)
 
@@ -44,12 +44,12 @@ class RecordedWristDetections:
         return cls(
             np.array([one.t_ns for one in found], np.int64),
             np.array([one.seq for one in found], np.int64),
-            _stacked([one.laser_uv for one in found], 2),
-            _stacked([one.laser_sigma_px for one in found]),
-            _stacked([one.laser_px for one in found]),
-            _stacked([one.tip_uv for one in found], 2),
-            _stacked([one.tip_sigma_px for one in found]),
-            _stacked([one.tip_depth for one in found]),
+            np.array([one.laser_uv for one in found]).reshape(-1, 5, 2),
+            np.array([one.laser_sigma_px for one in found]).reshape(-1, 5),
+            np.array([one.laser_px for one in found]).reshape(-1, 5),
+            np.array([one.tip_uv for one in found]).reshape(-1, 5, 2),
+            np.array([one.tip_sigma_px for one in found]).reshape(-1, 5),
+            np.array([one.tip_depth for one in found]).reshape(-1, 5),
         )
 
 
@@ -65,16 +65,10 @@ class WristRecordingFound:
     def summary(self) -> str:
         """One line for a person."""
         parts = [f"{self.frames} frames", f"{len(self.detections.t_ns)} strobe cycles"]
-        parts += [
-            f"{event.replace('_', ' ')} {count}"
-            for event, count in self.counts.items()
-            if count and event != "cycles"
-        ]
-        if self.mislabelled:
-            parts.append(
-                f"{self.mislabelled} frames lit otherwise than frames.csv says (its illumination is not used)"
-            )
-        return ", ".join(parts)
+        events = {event: count for event, count in self.counts.items() if count and event != "cycles"}
+        parts += [f"{event.replace('_', ' ')} {count}" for event, count in events.items()]
+        lit = f"{self.mislabelled} frames lit otherwise than frames.csv says (its illumination is not used)"
+        return ", ".join([*parts, lit] if self.mislabelled else parts)
 
 
 def view_of(
@@ -143,22 +137,11 @@ def detect_wrist_recording(
         frame = Frame(row.seq, row.t_ns, row.t_ns, image, row.illumination, exposure_us=own.exposure_us)
         if (seen := detector.push(frame)) is not None:
             found.append(seen.message(camera, session=0))
-            mislabelled += _mislabelled(seen.cycle)
+            frames = (seen.cycle.ambient, seen.cycle.laser, seen.cycle.led)
+            mislabelled += sum(
+                frame.illumination not in (lit, Illumination.NONE)  # NONE is no label
+                for frame, lit in zip(frames, CYCLE, strict=True)
+            )
         progress(i + 1, len(rows))
     detections = RecordedWristDetections.of(found)
     return WristRecordingFound(detections, len(rows), detector.counts, mislabelled)
-
-
-def _mislabelled(cycle: StrobeCycle) -> int:
-    """Count the frames of a cycle whose label contradicts the strobe; NONE is none."""
-    taken = (
-        (cycle.ambient, Illumination.AMBIENT),
-        (cycle.laser, Illumination.LASER),
-        (cycle.led, Illumination.LED),
-    )
-    return sum(frame.illumination not in (lit, Illumination.NONE) for frame, lit in taken)
-
-
-def _stacked(rows: list[Float], *last: int) -> Float:
-    """Rows (5, ...) on one another, (T, 5, ...); T may be 0."""
-    return np.array(rows, np.float64).reshape(len(rows), 5, *last)

@@ -17,11 +17,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from common.arrays import Bool, Float, Image, Int
+from common.arrays import Bool, Float, Float32, Image, Int
 from common.geometry.transforms import rigid
 from common.hand.model import CHAINS, METACARPALS
 from common.hand.wrist import STRAIGHT, forearm_palm
-from slave.wrist.led_image import NEAREST_M, SHRINK, Float32, WristView, in_image, shrink
+from slave.wrist.led_image import NEAREST_M, SHRINK, WristView, in_image, shrink
 
 STEP_RAD = float(np.radians(4.0))
 _MOST_STEPS = np.array([8, 4])  # of flexion, deviation: 32 and 16 degrees

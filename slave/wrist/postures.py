@@ -15,12 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.arrays import Float
-from common.errors import CalibrationError
+from common.arrays import Float, Float32
 from common.geometry.tapered_capsules import Capsules, first_hits, terms
 from common.geometry.transforms import rotation_vector_to_matrix
 from common.hand.model import CHAINS, FINGER_JOINTS, Fingertips
-from slave.wrist.led_image import NEAREST_M, Float32, WristView, thumb_postures
+from slave.wrist.led_image import NEAREST_M, WristView, circle_of, thumb_postures, unseen
 
 MCP_RAD = np.radians(np.arange(-10.0, 111.0, 6.0))
 PIP_RAD = np.radians(np.arange(0.0, 121.0, 6.0))
@@ -34,7 +33,6 @@ END, BONES, HIGHEST, ABOVE, APEX = 0, slice(0, 6), 6, slice(7, 13), 13
 SAMPLES = APEX + 1
 _ALONG = ((2, 0.35), (1, 0.75), (1, 0.3), (0, 0.75), (0, 0.5))  # bone, share of it
 _ABOVE = tuple((far, angle) for far in (1.4, 1.9) for angle in (-0.5, 0.0, 0.5))  # of the joint's radius, rad
-_ORIGIN = np.zeros(3)
 
 
 class Postures(NamedTuple):
@@ -65,17 +63,6 @@ class Postures(NamedTuple):
     twist: Float32
 
 
-class _OfFinger(NamedTuple):
-    """Rows of one finger, as of `Postures`; `laser` (H, 3, 2)."""
-
-    uv: Float
-    near: Float
-    laser: Float
-    open: Float
-    end: Float
-    twist: Float
-
-
 @lru_cache(maxsize=8)
 def plane_axes(view: WristView) -> Float:
     """Unit vectors (2, 3) in the laser's plane: to the right in the image, and away."""
@@ -92,9 +79,7 @@ def postures_of(view: WristView) -> Postures:
         view.model.forward(view.T_camera_palm, np.zeros((5, 4))).position_m[CHAINS[1:, 0]]
     )
     if not (np.isfinite(knuckles).all() and knuckles[:, 1].max() < view.optics.height_px):
-        raise CalibrationError(
-            "T_camera_palm: the camera does not see the fingers of this hand; calibrate the palm's pose"
-        )
+        raise unseen("fingers")
     pip, share = (each.ravel() for each in np.meshgrid(PIP_RAD, DIP_PER_PIP, indexing="ij"))
     long = np.zeros((len(MCP_RAD), len(pip), 3, 5, 4))
     long[..., 0] = ABDUCTION_RAD * np.array([-1.0, 0.0, 1.0])[:, None]
@@ -103,26 +88,20 @@ def postures_of(view: WristView) -> Postures:
     long = long.reshape(-1, 3, 5, 4)
     thumb = thumb_postures(view, *THUMB_POSTURES)[:, None]
     fingers = [_postures(view, finger, long if finger else thumb) for finger in range(5)]
-    uv, near, open_, end, twist = (
-        np.concatenate([getattr(one, of) for one in fingers]).astype(np.float32)
-        for of in ("uv", "near", "open", "end", "twist")
-    )
-    laser = np.moveaxis(np.array([one.laser for one in fingers[1:]]), (2, 3), (0, 1))
-    return Postures(
-        len(thumb),
-        uv,
-        np.ascontiguousarray(uv[:, :, END]),
-        near,
-        np.ascontiguousarray(fingers[0].laser[:, 0].T, np.float32),
-        np.ascontiguousarray(laser, np.float32),
-        open_,
-        end,
-        twist,
-    )
+    laser, *others = zip(*fingers, strict=True)
+    uv, *others = (np.concatenate(each).astype(np.float32) for each in others)
+    middle = np.ascontiguousarray(uv[:, :, END])
+    of_thumb = np.ascontiguousarray(laser[0][:, 0].T, np.float32)
+    of_fingers = np.ascontiguousarray(np.moveaxis(np.array(laser[1:]), (2, 3), (0, 1)), np.float32)
+    near, open_, end, twist = others
+    return Postures(len(thumb), uv, middle, near, of_thumb, of_fingers, open_, end, twist)
 
 
-def _postures(view: WristView, finger: int, angles: Float) -> _OfFinger:
-    """Of one finger, at angles (H, A, 5, 4) [rad], A = 3 abductions or 1."""
+def _postures(view: WristView, finger: int, angles: Float) -> tuple[Float, ...]:
+    """Rows of one finger at angles (H, A, 5, 4) [rad], A = 3 abductions or 1.
+
+    `laser` (H, 3, 2), then `uv`, `near`, `open`, `end`, `twist` as of `Postures`.
+    """
     count, nodes = angles.shape[:2]
     joints = view.model.forward(view.T_camera_palm, angles.reshape(-1, 5, 4))
     chain = joints.position_m[:, CHAINS[finger]]
@@ -149,11 +128,8 @@ def _postures(view: WristView, finger: int, angles: Float) -> _OfFinger:
     )
     twist = _twist(view, finger, angles[:, middle], bones, apex, radius)
     size = view.optics.matrix[0, 0] * radius[3] / np.maximum(bones[:, 3, 2], NEAREST_M)
-    angle = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
     around = 1.4  # of its radius: where other parts of the finger are looked for
-    ring = uv[:, middle, END, None] + around * size[:, None, None] * np.stack(
-        [np.cos(angle), np.sin(angle)], axis=-1
-    )
+    ring = uv[:, middle, END, None] + around * size[:, None, None] * circle_of(DIRECTIONS)
     near, first = _drawn(view, bones, radius, np.concatenate([uv[:, middle], ring], axis=1))
     distance = np.linalg.norm(apex, axis=-1)
     facing = -(along * apex).sum(axis=-1) / distance
@@ -162,10 +138,10 @@ def _postures(view: WristView, finger: int, angles: Float) -> _OfFinger:
     good = (bones[..., 2] > NEAREST_M).all(axis=1) & np.isfinite(uv.reshape(count, -1)).all(axis=1)
     laser[~good.repeat(nodes)] = np.nan
     near[~good] = 0.0
-    return _OfFinger(
+    return (
+        _parabola((laser @ plane_axes(view).T).reshape(count, nodes, 1, 2))[:, :, 0],
         np.nan_to_num(_parabola(uv)),
         near[:, :APEX],
-        _parabola((laser @ plane_axes(view).T).reshape(count, nodes, 1, 2))[:, :, 0],
         np.asarray(near[:, SAMPLES:] == 0.0, np.float64),
         np.nan_to_num(np.stack([size, facing, seen], axis=-1)),
         np.nan_to_num(twist),
@@ -250,11 +226,10 @@ def _above(view: WristView, bones: Float, radius: Float, nodes: int) -> list[Flo
 
 def _drawn(view: WristView, bones: Float, radius: Float, uv: Float) -> tuple[Float, Float]:
     """Nearness [1/m], distance [m] (T, S) at pixels (T, S, 2), joints (T, 4, 3) [m]."""
-    near, first = np.zeros(uv.shape[:2]), np.full(uv.shape[:2], np.inf)
-    chunk = 4096
-    for k in range(0, len(bones), chunk):
-        part = slice(k, k + chunk)
-        near[part], first[part] = _drawn_some(view, bones[part], radius, uv[part])
+    chunk = 4096  # bounds the memory
+    parts = [slice(k, k + chunk) for k in range(0, len(bones), chunk)]
+    drawn = [_drawn_some(view, bones[part], radius, uv[part]) for part in parts]
+    near, first = (np.concatenate(each) for each in zip(*drawn, strict=True))
     return near, first
 
 
@@ -263,7 +238,7 @@ def _drawn_some(view: WristView, bones: Float, radius: Float, uv: Float) -> tupl
     count = len(bones)
     near_r, far_r = (np.tile(part, count) for part in (radius[:-1], radius[1:]))
     capsules = Capsules(bones[:, :-1].reshape(-1, 3), bones[:, 1:].reshape(-1, 3), near_r, far_r)
-    known = terms(capsules, _ORIGIN, np.float64).reshape(12, count, 3)
+    known = terms(capsules, np.zeros(3), np.float64).reshape(12, count, 3)
     distance = np.stack([first_hits(known[:, :, k, None], np.moveaxis(ray, -1, 0)) for k in range(3)])
     which, distance = distance.argmin(axis=0), distance.min(axis=0)
     hit = np.isfinite(distance)

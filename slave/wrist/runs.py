@@ -30,6 +30,8 @@ class RunSettings(NamedTuple):
     column: float = 1024.0  # rows of a column when all are counted through: more than an image has
     jump_px: float = 6.0  # between columns: another surface
     thickest_px: int = 64  # the line on a thumb right before the camera; what is thicker is no line
+    steepest: float = 8.0  # px of row per root of a column: how fast a line goes round the side of a finger
+    long: int = 5  # columns from one end of a line to the other, from which on its ends are drawn straight
 
 
 SETTINGS = RunSettings()
@@ -59,13 +61,10 @@ class Runs:
 
 
 _NONE_INT: Int = np.empty(0, dtype=np.int64)
-NO_RUNS = Runs(_NONE_INT, np.empty(0), _NONE_INT, _NONE_INT, np.empty(0), _NONE_INT, _NONE_INT)
-
-
-def lines(laser: Image, first_row: int) -> tuple[Runs, Bool]:
-    """Runs of the rows from `first_row` on, and which (N,) lie on a line."""
-    runs = line_runs(laser, first_row)
-    return runs, in_lines(runs)
+NO_LINES: tuple[Runs, Bool] = (
+    Runs(_NONE_INT, np.empty(0), _NONE_INT, _NONE_INT, np.empty(0), _NONE_INT, _NONE_INT),
+    np.empty(0, np.bool_),
+)
 
 
 def bright(laser: Image, first_row: int) -> tuple[Image, Image, tuple[int, int]]:
@@ -89,11 +88,11 @@ def bright(laser: Image, first_row: int) -> tuple[Image, Image, tuple[int, int]]
     return np.asarray(cv2.transpose(band), np.uint8), np.asarray(cv2.transpose(least), np.uint8), corner
 
 
-def line_runs(laser: Image, first_row: int) -> Runs:
-    """The runs of the rows from `first_row` on."""
+def lines(laser: Image, first_row: int) -> tuple[Runs, Bool]:
+    """Runs of the rows from `first_row` on, and which (N,) lie on a line."""
     band, least, (left, top) = bright(laser, first_row)
     if not band.size:
-        return NO_RUNS
+        return NO_LINES
     width, height = band.shape
     over = np.zeros((width, height + 2), np.uint8)
     over[:, 1:-1] = cv2.compare(band, least, cv2.CMP_GT)
@@ -107,11 +106,12 @@ def line_runs(laser: Image, first_row: int) -> Runs:
         levels = levels[np.repeat(good, size)]
         column, begin, size = column[good], begin[good], size[good]
     if not len(size):
-        return NO_RUNS
+        return NO_LINES
     centre, peak = _across(levels, size)
     column += left
     begin += top
-    return _linked(column, begin + centre, begin, begin + size, peak)
+    runs = _linked(column, begin + centre, begin, begin + size, peak)
+    return runs, in_lines(runs)
 
 
 def _across(levels: Image, size: Int) -> tuple[Float, Float]:
@@ -134,8 +134,6 @@ def _across(levels: Image, size: Int) -> tuple[Float, Float]:
 def in_lines(runs: Runs) -> Bool:
     """Return which runs belong to a line: long enough, and no glow of what is near."""
     peak, joins = runs.peak, runs.joins
-    if not len(peak):
-        return np.empty(0, dtype=np.bool_)
     columns = np.diff(np.append(runs.first, len(peak)))
     brightest = np.zeros(len(joins))
     np.maximum.at(brightest, joins, np.maximum.reduceat(peak, runs.first))
@@ -197,8 +195,6 @@ def _linked(column: Int, row: Float, start: Int, end: Int, peak: Float) -> Runs:
 
 
 NONE = -1  # no finger
-STEEPEST = 8.0  # px of row per root of a column: how fast a line goes round the side of a finger
-LONG = 5  # columns from one end of a line to the other, from which on its ends are drawn straight
 
 
 class FingerLines(NamedTuple):
@@ -207,14 +203,14 @@ class FingerLines(NamedTuple):
     Attributes:
         line: (5,) its length [px].
         uv: (5, 2) its centroid [px]; NaN: none.
-        apart: (5,) half of how far the middle of a line in parts lies from that of its longest part [px]; NaN: whole.
+        split_px: (5,) half the way from the middle of a line in parts to that of its longest part; NaN: whole.
         cut: (5,) whether the image ends on it.
         brightest: (5,) its highest level.
     """
 
     line: Float
     uv: Float
-    apart: Float
+    split_px: Float
     cut: Bool
     brightest: Float
 
@@ -251,7 +247,7 @@ def measure(runs: Runs, finger: Int, width_px: int) -> FingerLines:
     cut[finger[on & ((u < 1.0) | (u > width_px - 2.0))]] = True
     brightest = np.zeros(6)
     np.maximum.at(brightest, finger, runs.peak)  # those of no finger come last
-    return FingerLines(line, uv, _apart(points, finger, left, right), cut, brightest[:5])
+    return FingerLines(line, uv, _split_px(points, finger, left, right), cut, brightest[:5])
 
 
 def _of_fingers(of: Int, weight: Float) -> Float:
@@ -259,8 +255,8 @@ def _of_fingers(of: Int, weight: Float) -> Float:
     return np.asarray(np.bincount(of, weight, 6)[1:], np.float64)
 
 
-def _apart(points: Float, finger: Int, left: Int, right: Int) -> Float:
-    """Return `apart` (5,) of `FingerLines`, by the first and last run of each part."""
+def _split_px(points: Float, finger: Int, left: Int, right: Int) -> Float:
+    """`FingerLines.split_px` (5,), by the first and last run of each part."""
     out = np.full(5, np.nan)
     part = finger[left]
     for of in np.flatnonzero(np.bincount(part, minlength=5) > 1).tolist():
@@ -280,12 +276,13 @@ def _ends(points: Float, left: Int, right: Int) -> tuple[Float, Int]:
     Left ends first. A line goes round a finger until it is seen no more: near its end it falls away as the root of the
     distance to the end does, most of it in less than a column, and dark. So a long one is continued from within.
     """
-    long = np.where(right - left >= LONG, 1, 0)
+    long = np.where(right - left >= SETTINGS.long, 1, 0)
     inner = np.concatenate([left + 2 * long, right - 2 * long])
     deep = np.concatenate([left + 5 * long, right - 5 * long])
     outer = points[np.concatenate([left, right])]
     outer[: len(left), 0] -= 0.5
     outer[len(left) :, 0] += 0.5
-    steepness = np.clip((points[deep, 1] - points[inner, 1]) / (np.sqrt(5.5) - np.sqrt(2.5)), 0.0, STEEPEST)
+    steepness = (points[deep, 1] - points[inner, 1]) / (np.sqrt(5.5) - np.sqrt(2.5))
+    steepness = np.clip(steepness, 0.0, SETTINGS.steepest)
     outer[:, 1] = points[inner, 1] - steepness * np.sqrt(2.5)
     return outer, inner

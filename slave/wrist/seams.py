@@ -8,16 +8,14 @@ Paths are found by dynamic programming from both ends: the two halves of every b
 that one loop over half of the stations serves all; the way back only reads which way each sample was reached.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate, pairwise
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from common.arrays import Float, Image, Int
-from common.errors import CalibrationError
+from common.arrays import Float, Float32, Image, Int
 from common.hand.model import CHAINS, METACARPALS
 from common.hand.profiles import ABDUCTION
 from slave.wrist.led_image import (
@@ -28,13 +26,13 @@ from slave.wrist.led_image import (
     finger_postures,
     in_image,
     thumb_postures,
+    unseen,
 )
 
 FENCE = 1e6  # energy of samples between search bands, two or more: no path leaves its own
 STEP_COST = np.float32(0.02)  # energy of a step aside between stations
 # samples aside, and what they cost
 _MOVES = ((-1, STEP_COST), (1, STEP_COST), (-2, 2 * STEP_COST), (2, 2 * STEP_COST))
-Float32 = npt.NDArray[np.float32]
 
 
 def minimum_cost_paths(energy: Float32, widths: tuple[int, ...]) -> Int:
@@ -102,8 +100,6 @@ STATION_PX = 10.0
 _FIRST_RADIUS_PX = 80.0  # nearer to its root the thumb has no seam
 LATERAL = (25, 25, 25, 61)  # samples across: index|middle, middle|ring, ring|little, thumb
 MARGIN = 12  # samples beyond either edge of a search band: about a finger's breadth
-_NO_MAP: Float32 = np.empty((0, 0), dtype=np.float32)
-_UNSEEN = "T_camera_palm: the camera does not see the {} of this hand; calibrate the palm's pose"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,8 +107,8 @@ class SearchBands:
     """Search bands of the four seams, in the order of `LATERAL`; S stations.
 
     Attributes:
-        row: First row of the stations of the three finger seams [px].
-        radius: Radius of the first station of the thumb's seam [px].
+        rows: (S,) stations of the three finger seams [px].
+        radii: (S,) stations of the thumb's seam [px].
         root: (2,) the thumb's root in the image [px]; angles are about it.
         up: (2,) image direction of angle 0, from the root to the middle finger's knuckle.
         thumb_side: +1.0 where the thumb is to the right in the image, -1.0 to the left.
@@ -126,8 +122,8 @@ class SearchBands:
         palm: (P, 2) columns and rows of the image where the palm is; none where the image does not show it.
     """
 
-    row: float
-    radius: float
+    rows: Float
+    radii: Float
     root: Float
     up: Float
     thumb_side: float
@@ -141,15 +137,7 @@ class SearchBands:
 
     def polar(self, uv: Float) -> tuple[Float, Float]:
         """Radius [px], angle [rad] to the thumb's side of pixels (N, 2) about its root."""
-        x, y = uv[:, 0] - self.root[0], uv[:, 1] - self.root[1]
-        along = x * self.up[0] + y * self.up[1]
-        across = self.thumb_side * (y * self.up[0] - x * self.up[1])
-        return np.hypot(x, y), np.arctan2(across, along)
-
-    def lateral(self, seam: int) -> Float:
-        """Lateral positions (S, LATERAL[seam] + 2 MARGIN) of the samples of one band."""
-        share = np.arange(-MARGIN, LATERAL[seam] + MARGIN, dtype=np.float64) / (LATERAL[seam] - 1) * 2.0 - 1.0
-        return self.middle[seam, :, None] + self.half[seam, :, None] * share
+        return _polar(uv, self.root, self.up, self.thumb_side)
 
     def across(self, seams: slice, path: Int) -> Float:
         """Return the lateral positions (M, S) of samples (M, S) of some search bands."""
@@ -161,16 +149,10 @@ class SearchBands:
         share = (lateral - self.middle[seam]) / self.half[seam]
         return (share + 1.0) * (LATERAL[seam] - 1) / 2.0 + MARGIN
 
-    def pixels(self, seam: int, lateral: Float) -> Float:
-        """Pixels (S, ..., 2) of lateral positions (S, ...) of one seam."""
-        station = np.arange(len(lateral), dtype=np.float64).reshape(-1, *[1] * (lateral.ndim - 1))
-        if seam < 3:
-            rows = np.broadcast_to(self.row + STATION_PX * station, lateral.shape)
-            return np.stack([lateral, rows], axis=-1)
-        r = self.radius + STATION_PX * station
-        along, across = r * np.cos(lateral), self.thumb_side * r * np.sin(lateral)
-        x, y = self.up
-        return self.root + np.stack([along * x - across * y, along * y + across * x], axis=-1)
+
+def _polar(uv: Float, root: Float, up: Float, thumb_side: float) -> tuple[Float, Float]:
+    x, y = uv[:, 0] - root[0], uv[:, 1] - root[1]
+    return np.hypot(x, y), np.arctan2(thumb_side * (y * up[0] - x * up[1]), x * up[0] + y * up[1])
 
 
 @lru_cache(maxsize=128)  # one for each way the palm may lie
@@ -182,19 +164,28 @@ def search_bands_of(view: WristView) -> SearchBands:
     up = (knuckles[1] - root) / np.linalg.norm(knuckles[1] - root)
     unused_px = 80.0  # rows not used: the fingers end below the upper edge of the image
     stations = int((view.optics.height_px - unused_px) // STATION_PX)
-    row = view.optics.height_px - STATION_PX * stations
-    empty = np.empty((4, stations))
-    still = SearchBands(
-        row, _FIRST_RADIUS_PX, root, up, thumb_side, empty, empty, _NO_MAP, 0, _NO_MAP, _NO_MAP, _palm(view)
+    steps = STATION_PX * np.arange(stations, dtype=np.float64)
+    rows, radii = view.optics.height_px - STATION_PX * stations + steps, _FIRST_RADIUS_PX + steps
+    *of_thumb, crossed = _thumb_workspace(view, root, up, thumb_side, stations)
+    middle, half = (
+        np.vstack([three, np.full(stations, thumb)])
+        for three, thumb in zip(_between_fingers(view, rows), of_thumb, strict=True)
     )
-    *workspace, crossed = _thumb_workspace(view, still, stations)
-    rows = row + STATION_PX * np.arange(stations, dtype=np.float64)
-    three = _between_fingers(view, rows)
-    middle, half = (np.vstack([three[k], np.full(stations, workspace[k])]) for k in (0, 1))
-    placed = replace(still, middle=middle, half=half, weight=_weight(view, rows), thumb_crosses=crossed)
-    grids = [placed.pixels(seam, placed.lateral(seam)) for seam in range(4)]
-    grid = np.concatenate(grids, axis=1)
-    return replace(placed, map_x=grid[..., 0].astype(np.float32), map_y=grid[..., 1].astype(np.float32))
+    u: list[Float] = []
+    v: list[Float] = []
+    for seam, count in enumerate(LATERAL):
+        share = np.arange(-MARGIN, count + MARGIN, dtype=np.float64) / (count - 1) * 2.0 - 1.0
+        lateral = middle[seam, :, None] + half[seam, :, None] * share
+        if seam < 3:
+            u.append(lateral)
+            v.append(np.broadcast_to(rows[:, None], lateral.shape))
+        else:
+            along, across = radii[:, None] * np.cos(lateral), thumb_side * radii[:, None] * np.sin(lateral)
+            u.append(root[0] + (along * up[0] - across * up[1]))
+            v.append(root[1] + (along * up[1] + across * up[0]))
+    map_x, map_y = (np.concatenate(each, axis=1).astype(np.float32) for each in (u, v))
+    weight, palm = _weight(view, rows), _palm(view)
+    return SearchBands(rows, radii, root, up, thumb_side, middle, half, weight, crossed, map_x, map_y, palm)
 
 
 def _palm(view: WristView) -> Int:
@@ -248,7 +239,7 @@ def _band(at: Float, low: Float, high: Float, stations: Float) -> tuple[Float, F
     near = np.abs(at[None] - stations[:, None]) <= STATION_PX
     known = near.any(axis=1)
     if not known.any():
-        raise CalibrationError(_UNSEEN.format("fingers"))
+        raise unseen("fingers")
     lows = np.array([np.quantile(low[row], 0.1) for row in near[known]])
     highs = np.array([np.quantile(high[row], 0.9) for row in near[known]])
     ends = [np.interp(stations, stations[known], end) for end in (lows, highs)]
@@ -256,17 +247,19 @@ def _band(at: Float, low: Float, high: Float, stations: Float) -> tuple[Float, F
     return (lows + highs) / 2.0, (highs - lows) / 2.0
 
 
-def _thumb_workspace(view: WristView, still: SearchBands, stations: int) -> tuple[float, float, int]:
+def _thumb_workspace(
+    view: WristView, root: Float, up: Float, thumb_side: float, stations: int
+) -> tuple[float, float, int]:
     """Middle, half width [rad] of the thumb's band; stations that it always crosses."""
     points = along_bones(view, thumb_postures(view, 7, 7, 3, 3))[:, 0, PER_BONE:]  # beyond the metacarpal
     uv, depth = in_image(view, points)
-    radius, angle = still.polar(uv.reshape(-1, 2))
+    radius, angle = _polar(uv.reshape(-1, 2), root, up, thumb_side)
     scale = view.optics.matrix[0, 0] / np.maximum(depth, NEAREST_M).ravel()
     breadth = np.arcsin(np.minimum(scale * view.model.radius_m[4] / np.maximum(radius, 1.0), 0.9))
     seen = (depth > NEAREST_M).ravel()
     ends = depth[:, -1] > NEAREST_M
     if not ends.any():
-        raise CalibrationError(_UNSEEN.format("thumb"))
+        raise unseen("thumb")
     rare = 0.02  # share of the postures of a sweep rejected at either end
     low, high = np.quantile((angle - breadth)[seen], (rare, 1.0 - rare))
     tips = radius.reshape(len(points), -1)[:, -1]

@@ -34,21 +34,13 @@ _SIZE = (80, 60)  # cells across and down: 8 x 8 px of 640 x 480
 
 
 class IlluminationSettings(NamedTuple):
-    """Numbers that tell laser, LED and ambient frames apart."""
+    """Numbers that distinguish laser, LED and ambient frames."""
 
-    noise: int = (
-        6  # levels: five standard deviations of a cell near saturation (16 px of 5 levels of shot noise)
-    )
+    noise: int = 6  # levels: five deviations of a cell near saturation (16 px of 5 levels of shot noise)
     swing: float = 0.125  # of the ambient light: how far lamps on the mains swing between two frames
     line: int = 20  # levels beyond that: a line that a centroid can be taken of
-    led_least: float = (
-        0.08  # share of the cells that LEDs light broadly: a palm fills a sixth of the picture or more
-    )
-    led_never: float = (
-        0.04  # share up to which it is none: the halo of a laser on a near thumb, a hand that moved
-    )
-    # How many times as many cells of flash on the hand as there are
-    laser_of_elsewhere: float = 4.0  # of flash elsewhere
+    led_least: float = 0.08  # share of the cells that LEDs light broadly: a palm fills a sixth or more
+    led_never: float = 0.04  # share up to which it is none: the halo of a laser on a near thumb, motion
     valid_least: float = 0.25  # share of the cells that are not saturated: with fewer nothing is decided
 
 
@@ -65,20 +57,17 @@ _SMALL = np.ones((3, 3), np.uint8)  # narrower than a finger, wider than a windo
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Evidence of ambient, laser, LED: log2 of measures over their thresholds."""
+    """Evidence of ambient, laser, LED: log2 of measures over thresholds; -inf: none."""
 
-    led: float  # the LED frame has broad light that the ambient frame has not
-    laser: float  # the laser frame has a flash where the LEDs light
-    alone: float  # no such lines in the ambient frame, nor as many flashes there or elsewhere
-    steady: float  # nothing broad came or went with the laser, or went with the LEDs
+    led: float = -inf  # the LED frame has broad light that the ambient frame has not
+    laser: float = -inf  # the laser frame has a flash where the LEDs light
+    alone: float = -inf  # no such lines in the ambient frame, nor as many flashes there or elsewhere
+    steady: float = -inf  # nothing broad came or went with the laser, or went with the LEDs
 
     @property
     def margin(self) -> float:
         """The weakest of the four [octaves]; not positive: not sure."""
         return min(self.led, self.laser, self.alone, self.steady)
-
-
-NO_EVIDENCE = Evidence(-inf, -inf, -inf, -inf)
 
 
 def coarse(image: Image) -> Image:
@@ -93,42 +82,39 @@ def coarse(image: Image) -> Image:
 
 def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
     """Evidence of three coarse frames (60, 80); -inf: not evaluated."""
-    darker = cv2.min(ambient, led)
-    valid = _valid(darker)
+    valid = _valid(cv2.min(ambient, led))
     if valid < SETTINGS.valid_least * ambient.size:
-        return NO_EVIDENCE
-    noise = cv2.LUT(darker, _NOISE_OF_LEVEL)
-    led_gain = cv2.subtract(cv2.subtract(led, ambient), noise)
+        return Evidence()
+    led_gain, led_loss = _each_over(led, ambient)
     if cv2.countNonZero(led_gain) <= SETTINGS.led_least * valid:
-        return NO_EVIDENCE
+        return Evidence()
     lit = _octaves(_broad(led_gain) / valid, SETTINGS.led_least)
     laser_gain, laser_loss = _each_over(laser, ambient)
     laser_least = 8  # cells of flash: the line on one finger
     if not lit > 0.0 or cv2.countNonZero(laser_gain) <= laser_least:
-        return Evidence(lit, -inf, -inf, -inf)
-    led_loss = cv2.subtract(cv2.subtract(ambient, led), noise)
+        return Evidence(lit)
     halo = 0.5  # of the light of the LEDs: what a line scatters over near skin is mostly less
     above_halo = cv2.subtract(laser_gain, cv2.convertScaleAbs(led_gain, alpha=halo))
     steady = -_octaves(
         max(_broad(over) for over in (above_halo, laser_loss, led_loss)) / valid, SETTINGS.led_never
     )
     if not steady > 0.0:
-        return Evidence(lit, -inf, -inf, steady)
+        return Evidence(lit, steady=steady)
     led_over_laser, laser_over_led = _each_over(led, laser)
     line = cv2.subtract(
         _above_column(laser_gain), cv2.convertScaleAbs(_above_column(led_gain), beta=SETTINGS.line)
     )
     flash = _thin(cv2.max(cv2.min(laser_gain, laser_over_led), line))
     if cv2.countNonZero(flash) <= laser_least:
-        return Evidence(lit, -inf, -inf, steady)
+        return Evidence(lit, steady=steady)
     near = _near(cv2.min(led_gain, led_over_laser))
     on_hand = cv2.countNonZero(cv2.bitwise_and(flash, near))
     elsewhere = cv2.countNonZero(cv2.subtract(flash, cv2.dilate(near, _AROUND)))
     own = _shared(cv2.min(laser_loss, led_loss), lambda: _near(led_over_laser))
     excess = max(_shared(loss, lambda: _inside(led_gain)) for loss in (led_loss, laser_loss))
-    laser_of_own = 4.0  # of flash on the hand in the ambient frame: another laser frame has as many
-    laser_of_excess = 8.0  # of lines within the hand that the ambient frame has and another has not
-    rest = max(SETTINGS.laser_of_elsewhere * elsewhere, laser_of_own * own, laser_of_excess * excess)
+    # How many times as many cells of flash on the hand as of flash elsewhere; of flash on the hand in the ambient
+    # frame, of which another laser frame has as many; of lines within the hand that it has and another frame has not.
+    rest = max(4.0 * elsewhere, 4.0 * own, 8.0 * excess)
     return Evidence(lit, _octaves(on_hand, laser_least), _octaves(on_hand, rest), steady)
 
 
@@ -138,22 +124,16 @@ def unlit(frames: Sequence[Image]) -> bool:
     valid = _valid(darkest)
     if valid < SETTINGS.valid_least * darkest.size:
         return False
-    gain = cv2.subtract(reduce(cv2.max, frames), darkest)
-    return (
-        _broad(cv2.subtract(gain, cv2.LUT(darkest, _NOISE_OF_LEVEL)), SETTINGS.led_never * valid)
-        <= SETTINGS.led_never * valid
-    )
+    gain, _ = _each_over(reduce(cv2.max, frames), darkest)
+    return _broad(gain, SETTINGS.led_never * valid) <= SETTINGS.led_never * valid
 
 
 def brighter(frame: Image, other: Image) -> bool:
     """Whether a coarse frame has broad light the other lacks, and not vice versa."""
-    darker = cv2.min(frame, other)
-    valid = max(_valid(darker), SETTINGS.valid_least * frame.size)
-    noise = cv2.LUT(darker, _NOISE_OF_LEVEL)
-    gain = cv2.subtract(cv2.subtract(frame, other), noise)
-    if _broad(gain, SETTINGS.led_least * valid) <= SETTINGS.led_least * valid:
-        return False
-    return _broad(cv2.subtract(cv2.subtract(other, frame), noise)) <= SETTINGS.led_never * valid
+    valid = max(_valid(cv2.min(frame, other)), SETTINGS.valid_least * frame.size)
+    gain, loss = _each_over(frame, other)
+    least = SETTINGS.led_least * valid
+    return _broad(gain, least) > least and _broad(loss) <= SETTINGS.led_never * valid
 
 
 def _valid(darker: _Cells) -> int:
@@ -215,7 +195,6 @@ def _octaves(value: float, threshold: float) -> float:
 
 
 CYCLE = 3  # periods
-EVENTS = ("cycles", "doubled", "gaps", "out_of_step", "unsure", "unlit")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -259,7 +238,9 @@ class Strobe:
         self._seen: list[_Seen] = []
         self._at: int | None = None
         self._due = 0
-        self.counts: Counter[str] = Counter(dict.fromkeys(EVENTS, 0))
+        self.counts = Counter(
+            {"cycles": 0, "doubled": 0, "gaps": 0, "out_of_step": 0, "unsure": 0, "unlit": 0}
+        )
         self.margin = np.nan
 
     def push(self, frame: Frame) -> StrobeCycle | None:
@@ -295,7 +276,7 @@ class Strobe:
         if before is not None and 0 < place - before < CYCLE:
             return None
         whole = len(self._seen) == CYCLE and self._seen[1].follows and self._seen[2].follows
-        found = evidence(*[one.cells for one in self._seen]) if whole else NO_EVIDENCE
+        found = evidence(*[one.cells for one in self._seen]) if whole else Evidence()
         if not found.margin > 0.0:
             if place >= self._due:
                 lit = place == self._due and found.led > 0.0

@@ -3,15 +3,13 @@
 The laser's plane stands still, and the palm lies as calibrated or as it was seen (`find_palm_pose`).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import cast
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from common.arrays import Bool, Float, Image, Int
+from common.arrays import Bool, Float, Float32, Image, Int
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import intersect_plane
 from common.hand.model import CHAINS
@@ -24,15 +22,8 @@ from slave.wrist.led_image import (
     radius_along,
     thumb_postures,
 )
-from slave.wrist.palm_pose import PalmPose
-
-Float32 = npt.NDArray[np.float32]
 
 _CELL_PX = 8
-# Beyond the skin over the thumb's MCP, from its root. A thumb that is bent before the palm meets the plane at its MCP,
-# half a centimetre either way as device and bones are known; a finger folded to the palm does so a centimetre beyond.
-_THUMBS_M, _NO_THUMBS_M = 4e-3, 10e-3
-_ORIGIN = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,58 +33,23 @@ class LaserWorkspace:
     cells: Bool  # (5, H / 8, W / 8), thumb ... little, where it can be
     plane_m: Float32  # (H, W, 3) what each pixel shows of the laser's plane, camera frame [m]; 0: nothing
     focal_px: float
-    T_camera_palm: Float  # (4, 4) how the palm lies [m]
-    flexed: bool  # whether the wrist is
     palm: "Palm"
     first_row: int  # above it the laser meets no finger
-
-    def at_palm_pose(self, palm_pose: PalmPose) -> "LaserWorkspace":
-        """The same where the palm lies just so."""
-        return replace(self, T_camera_palm=palm_pose.T_camera_palm, flexed=not palm_pose.straight)
 
     def holds(self, finger: Int, uv: Float) -> Bool:
         """Whether the laser can be on these fingers (N,) at pixels (N, 2) of the image."""
         column, row = self._cell(uv)
-        thumb = 0
-        ball_m = -3e-3  # nearer there is no finger
-        return self.cells[finger, row // _CELL_PX, column // _CELL_PX] & (
-            (finger == thumb) | (self.beyond_m(uv) > ball_m)
-        )
-
-    def beyond_m(self, uv: Float) -> Float:
-        """How far (N,) [m] the plane at pixels (N, 2) is beyond the skin of the MCP."""
-        return self.palm.beyond_m(self._before_palm(uv))
-
-    def on_plane(self, uv: Float) -> tuple[Float, Float]:
-        """Return `beyond_m` and `Palm.place` (N,) of the plane at pixels (N, 2)."""
-        points = self._before_palm(uv)
-        return self.palm.beyond_m(points), self.palm.place(points)
-
-    def on_palm(self, uv: Float) -> Bool:
-        """Whether a bent wrist has brought the palm into the plane at pixels (N, 2)."""
-        if not self.flexed:
-            return np.zeros(len(uv), np.bool_)
-        points = self._before_palm(uv)
-        return self.palm.surface(points, self.palm.place(points))
-
-    def only_thumb(self, beyond_m: Float, place: Float) -> Bool:
-        """Whether there (N,) the laser meets the thumb or nothing."""
-        return (beyond_m < _THUMBS_M) & (place < 1.5)
-
-    def no_thumb(self, beyond_m: Float, place: Float) -> Bool:
-        """Whether there (N,) the laser never meets the thumb."""
-        outside_palm = 0.5  # place: beyond the outside of the index
-        return (beyond_m > _NO_THUMBS_M) & (place > outside_palm)
+        return self.cells[finger, row // _CELL_PX, column // _CELL_PX]
 
     def metres_per_px(self, uv: Float) -> Float:
         """How much of the plane one pixel shows [m] at pixels (N, 2); 0: NaN or none."""
         column, row = self._cell(np.nan_to_num(uv))
         return np.where(np.isnan(uv[:, 0]), 0.0, self.plane_m[row, column, 2] / self.focal_px)
 
-    def _before_palm(self, uv: Float) -> Float:
+    def before_palm(self, uv: Float, T_camera_palm: Float) -> Float:
         """What pixels (N, 2) show of the plane, palm frame (N, 3) [m]."""
         column, row = self._cell(uv)
-        T = self.T_camera_palm
+        T = T_camera_palm
         return (self.plane_m[row, column] - T[:3, 3]) @ T[:3, :3]
 
     def _cell(self, uv: Float) -> tuple[Int, Int]:
@@ -155,9 +111,7 @@ def workspace_of(view: WristView) -> LaserWorkspace:
     rows = np.flatnonzero(held.any(axis=(0, 2)))
     plane = _plane(view.optics, *view.normal.tolist(), view.offset_m)
     first = _CELL_PX * int(rows[0]) if len(rows) else view.optics.height_px - 1
-    return LaserWorkspace(
-        held, plane, float(view.optics.matrix[0, 0]), view.T_camera_palm, False, _palm(view), first
-    )
+    return LaserWorkspace(held, plane, float(view.optics.matrix[0, 0]), _palm(view), first)
 
 
 def _cells(view: WristView, bones: Float, radius: Float) -> Image:
@@ -178,7 +132,7 @@ def _cells(view: WristView, bones: Float, radius: Float) -> Image:
         cells = np.zeros(shape, dtype=np.uint8)
         cells[row[some], column[some]] = 1
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(size) + 1, 2 * int(size) + 1))
-        out |= cast(Image, cv2.dilate(cells, kernel))
+        out |= np.asarray(cv2.dilate(cells, kernel), np.uint8)
     return out
 
 
@@ -187,7 +141,7 @@ def _plane(optics: CameraModel, x: float, y: float, z: float, offset_m: float) -
     """Point (H, W, 3) [m] of the plane at each pixel, camera frame; 0: nothing."""
     u, v = np.meshgrid(np.arange(optics.width_px), np.arange(optics.height_px))
     rays = optics.ray(np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float64))
-    points = intersect_plane(_ORIGIN, rays, np.array([x, y, z]), offset_m)
+    points = intersect_plane(np.zeros(3), rays, np.array([x, y, z]), offset_m)
     return np.nan_to_num(points).reshape(*u.shape, 3).astype(np.float32)
 
 

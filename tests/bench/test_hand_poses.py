@@ -132,7 +132,7 @@ def test_the_fixed_palm_is_right_for_a_hand_that_faces_the_cameras() -> None:
     np.testing.assert_allclose(fixed_palm(MODEL, facing.caps_m[0]), T[0], atol=1e-12)
     tips = tips_in_palm(T[0], facing.caps_m[0])
     for solver, tip in zip(finger_solvers(MODEL), tips, strict=True):
-        assert solver.solve(tip).reached
+        assert solver.closed_form(tip).reached
     back = MODEL.mount(MARKERS[BACK]).offset_m
     np.testing.assert_allclose(facing.caps_m[0, BACK], T[0, :3, 3] + FACING_ROTATION @ back)
 

@@ -1,7 +1,7 @@
 """Our solvers and others on the same targets: all run, the known answers come out, and planted bad ones are seen."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -158,7 +158,7 @@ def test_scipy_finds_the_hand_when_the_posture_prior_is_the_truth_and_markers_ar
 def test_the_estimator_ends_where_scipy_ends_on_the_same_residuals(noise: Noise) -> None:
     count = 20
     way = ScipyHand.of(MODEL, noise)
-    exact = DEFAULT._replace(tolerance=1e-12, tolerance_share=0.0)  # to the end
+    exact = replace(DEFAULT, tolerance=1e-12, tolerance_share=0.0)  # to the end
     solver = PointHand(MODEL, MARKERS, continuous=False, natural=True, faces=False, settings=exact)
     truth = draw(MODEL, 21, count)
     points, _ = seen(truth, noise, 21)

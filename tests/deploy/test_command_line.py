@@ -11,6 +11,7 @@ from common.sim.scenes import NAMES
 from common.sim.together import TOGETHER
 from common.sim.wrist.scene import AMBIENTS, MOTIONS
 from deploy import commands, demo
+from deploy.remote import DeployError
 from master.cli.table import program
 from master.commands.summary import summary_lines
 from master.replay import offline
@@ -74,7 +75,7 @@ def steps_of_replay(
 
     monkeypatch.setattr(offline, "_slave", step)
     monkeypatch.setattr(offline, "setups_with_hands", setups)
-    monkeypatch.setattr(offline, "solve_hands", solve)
+    monkeypatch.setattr(offline, "solve", solve)
     write(folder, cameras={name: camera(name) for name in ("left", "right", "palm")}, kind="both", rig=None,
           rigs=[rig("wrist", ("palm",)), rig()])  # fmt: skip
     (folder / "hand.json").write_text("{}")
@@ -271,7 +272,7 @@ def test_the_summary_lists_the_results_of_objects_and_gestures() -> None:
 def test_a_rig_whose_imu_is_none_is_named(tmp_path: Path) -> None:
     (tmp_path / "rigs").mkdir()
     (tmp_path / "rigs/odd.json").write_text(json.dumps({"cameras": ["left"], "imu": 5}))
-    with pytest.raises(demo.DemoError, match=r"odd\.json: cannot read the rig"):
+    with pytest.raises(DeployError, match=r"odd\.json: cannot read the rig"):
         rows("odd", tmp_path, tmp_path)
 
 
@@ -298,7 +299,7 @@ def test_of_both_kinds_each_sensor_has_its_rig_and_one_master_runs_all(tmp_path:
 def test_rigs_that_cannot_be_played_together_are_refused(
     rigs: tuple[str, ...], scene: str, expected: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(demo.DemoError, match=expected):
+    with pytest.raises(DeployError, match=expected):
         rows(rigs, ROOT / "calib_json", tmp_path, scene)
 
 

@@ -16,7 +16,7 @@ import pytest
 from deploy import deployment
 from deploy import payload as wheels_module
 from deploy.commands import prepared_keys
-from deploy.deployment import Ears, Host, Received, Wish, make_keys
+from deploy.deployment import DeployRequest, Host, ListenOptions, Received, make_keys
 from deploy.payload import BUNDLE, bundle, command, own_wheel, wheelhouse
 from deploy.remote import Deadline, DeployError, Remote, RigFile, Target, read_rig, targets_of
 from master.cli.table import program
@@ -230,7 +230,7 @@ def _hosts(output: list[str]) -> list[Remembered]:
 def _receive_only(
     monkeypatch: pytest.MonkeyPatch, received: dict[str, float], cause: str | None = None
 ) -> None:
-    def answer(_names: object, _ears: object) -> Received:
+    def answer(*_arguments: object) -> Received:
         return Received(received, cause)
 
     monkeypatch.setattr(deployment, "received_of", answer)
@@ -240,7 +240,7 @@ def test_a_machine_that_is_not_heard_goes_back_and_others_stay(monkeypatch: pyte
     output: list[str] = []
     hosts = _hosts(output)
     _receive_only(monkeypatch, {"right": 30.0})
-    failed = deployment._wait_for_senders(hosts, Ears((), Path("keys"), 3.0))
+    failed = deployment._wait_for_senders(hosts, ListenOptions((), Path("keys"), 3.0))
     assert failed == {
         "left": "no datagram of left in 3 s at the master; back at release 1.0-0",
         "right": None,
@@ -250,11 +250,11 @@ def test_a_machine_that_is_not_heard_goes_back_and_others_stay(monkeypatch: pyte
 
 
 def _before(monkeypatch: pytest.MonkeyPatch, received: Received) -> deployment.Before:
-    def answer(_names: object, _ears: object, _ended: object) -> Received:
+    def answer(*_arguments: object) -> Received:
         return received
 
     monkeypatch.setattr(deployment, "received_of", answer)
-    return deployment.Before(["left", "right"], Ears((), Path("keys"), 12.0))
+    return deployment.Before(["left", "right"], ListenOptions((), Path("keys"), 12.0))
 
 
 def test_what_streamed_at_a_master_is_listened_for_as_long_as_it_needs(
@@ -262,15 +262,15 @@ def test_what_streamed_at_a_master_is_listened_for_as_long_as_it_needs(
 ) -> None:
     streamed = _before(monkeypatch, Received({"left": 30.0, "right": 30.0}, None, True))
     assert streamed.at_master
-    assert streamed.ears(1.0).seconds == deployment.LEAST_S
-    assert streamed.ears(3.5).seconds == pytest.approx(7.0)
-    assert streamed.ears(60.0).seconds == pytest.approx(12.0)
-    assert streamed.ears(None).seconds == pytest.approx(12.0), "it did not run: nobody knows"
+    assert streamed.listening(1.0).seconds == deployment.LEAST_S
+    assert streamed.listening(3.5).seconds == pytest.approx(7.0)
+    assert streamed.listening(60.0).seconds == pytest.approx(12.0)
+    assert streamed.listening(None).seconds == pytest.approx(12.0), "it did not run: nobody knows"
     one_silent = _before(monkeypatch, Received({"left": 30.0}, None, True))
-    assert one_silent.ears(1.0).seconds == pytest.approx(12.0)
+    assert one_silent.listening(1.0).seconds == pytest.approx(12.0)
     no_master = _before(monkeypatch, Received({"left": 30.0, "right": 30.0}, None, False))
     assert not no_master.at_master
-    assert no_master.ears(1.0).seconds == pytest.approx(12.0)
+    assert no_master.listening(1.0).seconds == pytest.approx(12.0)
 
 
 def test_one_machine_by_two_names_is_refused(fake_ssh: Callable[[str], None]) -> None:
@@ -328,11 +328,11 @@ def test_what_was_not_changed_stays_and_so_does_all_if_nobody_can_listen(
     hosts = _hosts([])
     _receive_only(monkeypatch, {"left": 30.0})
     assert (
-        deployment._wait_for_senders(hosts, Ears((), Path("keys"), 3.0))["right"]
+        deployment._wait_for_senders(hosts, ListenOptions((), Path("keys"), 3.0))["right"]
         == "no datagram of right in 3 s at the master"
     )
     _receive_only(monkeypatch, {}, "cannot listen for it: port taken")
-    assert set(deployment._wait_for_senders(hosts, Ears((), Path("keys"), 3.0)).values()) == {
+    assert set(deployment._wait_for_senders(hosts, ListenOptions((), Path("keys"), 3.0)).values()) == {
         "cannot listen for it: port taken"
     }
     assert [host.back for host in hosts] == [0, 0]
@@ -421,14 +421,16 @@ def test_a_fleet_with_a_missing_keys_folder_is_refused(capsys: pytest.CaptureFix
 def test_each_machine_gets_what_its_own_cameras_need(
     output: tuple[str, ...], names: tuple[str, ...], driver: str
 ) -> None:
-    wish = Wish("10.0.0.2", DESK, ROOT, None, (), output, None, apt=True, dry_run=True, ready_s=9.0)
-    assert wish.driver(names) == driver
+    request = DeployRequest(
+        "10.0.0.2", DESK, ROOT, None, (), output, None, apt=True, dry_run=True, ready_s=9.0
+    )
+    assert request.driver(names) == driver
 
 
 def test_an_interruption_ends_what_waits_for_a_machine(fake_ssh: Callable[[str], None]) -> None:
     fake_ssh("sleep 300")
     deadline = Deadline(200.0)
-    threading.Timer(0.3, deadline.end).start()
+    threading.Timer(0.3, deadline.ended.set).start()
     began = time.monotonic()
     with pytest.raises(DeployError, match="interrupted"):
         Remote("host", (), deadline).run(["true"], b"", print)

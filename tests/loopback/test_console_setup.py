@@ -163,10 +163,10 @@ def by_keyboard(page: Page, picture: Locator, uv: Float) -> None:
     """The same without a mouse: the cross starts where it was last, so it is led to a corner first."""
     picture.focus()
     for key in ("ArrowLeft", "ArrowUp"):
-        for _ in range(45):
+        for _ in range(101):
             page.keyboard.press(key)
-    for key, pixels in zip(("ArrowRight", "ArrowDown"), (uv + 0.5) / 2.0 - 0.5, strict=True):
-        for _ in range(round(float(pixels) / 8.0)):
+    for key, share in zip(("ArrowRight", "ArrowDown"), (uv + 0.5) / MODE_PX, strict=True):
+        for _ in range(round(100.0 * float(share))):  # a step is a hundredth of the picture
             page.keyboard.press(key)
     page.keyboard.press("Enter")
 

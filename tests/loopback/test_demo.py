@@ -18,7 +18,7 @@ import pytest
 
 from common.arrays import Bool
 from common.sim.scenes import scene_by_name
-from master.outputs.poses import Poses, load_poses
+from master.outputs.poses import Poses
 from master.rig.setup import load_setup
 from tests.network_helpers import until
 
@@ -134,7 +134,7 @@ def test_demo_tracks_scores_and_leaves_its_results(demo_of: Demo, tmp_path: Path
     assert set(summary["stage_us"]) == {"frame_sync", "triangulate", "filter", "fabrik", "hand", "gestures"}
     for name in ("hand.png", "run.rrd", "poses.npz", "left.log", "right.log", "master.log"):
         assert (tmp_path / name).stat().st_size > 0, name
-    poses = load_poses(tmp_path / "poses.npz")
+    poses = Poses.load(tmp_path / "poses.npz")
     assert (np.diff(poses.t_ns) > 0).all()
     assert poses.valid[len(poses) // 2 :].all()
     assert _gone(_pids(lines[0]))
@@ -222,7 +222,7 @@ def test_a_killed_process_is_back_within_two_seconds_and_ctrl_c_still_ends_and_s
         log = (tmp_path / f"{name}.log").read_text()
         assert "Traceback" not in log
         assert "FATAL" not in log
-    poses = load_poses(tmp_path / "poses.npz")
+    poses = Poses.load(tmp_path / "poses.npz")
     measured = np.isfinite(poses.markers_raw_m.min(axis=2)).sum(axis=1) > 0  # two cameras contributed again
     after = {
         victim: poses.t_ns[(poses.t_ns > killed + 300_000_000) & measured]
@@ -273,7 +273,7 @@ def test_two_pairs_track_together_and_one_goes_on_while_the_other_is_gone(
     assert summary["marker_raw_mm"] < 4.0
     if summary["poses_per_s"] > LEAST_HZ:
         assert summary["marker_mm"] < 4.0
-    poses = load_poses(tmp_path / "poses.npz")
+    poses = Poses.load(tmp_path / "poses.npz")
     assert not _lost_while_seen(poses).any()
     # How long a pair is gone, and fingers unseen, depends on how busy the machine is: all joints only until then.
     together = poses.rows(0, int(np.searchsorted(poses.t_ns, killed_ns)))

@@ -120,9 +120,9 @@ def test_a_flood_of_hellos_in_anothers_name_takes_no_room_and_ends_no_session() 
     assert len(scene.master._sessions) == 2
     assert {
         name: away.host
-        for name, away in scene.master.rejected_peers.secrets(scene.wires.clock.now_ns()).items()
+        for name, away in scene.master.rejected_peers.lately("unproven", scene.wires.clock.now_ns()).items()
     } == {"left": THIEF[0]}
-    assert not scene.master.rejected_peers.duplicates(scene.wires.clock.now_ns())
+    assert not scene.master.rejected_peers.lately("duplicate", scene.wires.clock.now_ns())
     for one in replayed:  # from an address of his own: they make nothing new
         scene.wires.carry(one, THIEF, MASTER)
     scene.wires.run(PENDING_NS / S + 0.1)
@@ -216,7 +216,7 @@ def test_secrets_that_do_not_fit_are_named_on_both_sides(
     assert output in left.wrong
     assert left.refused[Refusal.SECRET] > 10
     assert link.refused[Refusal.SECRET] > 10
-    assert set(link.rejected_peers.secrets(wires.clock.now_ns())) == {"left"}
+    assert set(link.rejected_peers.lately("unproven", wires.clock.now_ns())) == {"left"}
     right = wires.new_slave("left", key=LinkKey(KEY, ROOT) if isinstance(master, LinkKey) else master)
     assert wires.run(2.0, lambda: right.started), "with its secret it is taken at once"
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from master.outputs.poses import load_poses
+from master.outputs.poses import Poses
 from tests.sockets import Listener, listeners, rows, undocumented
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -73,7 +73,7 @@ def test_the_grab_test_runs_scores_and_outlives_its_wrist_device(tmp_path: Path)
     assert "joint error, visible fingers" in output
     for name in ("hand.png", "run.rrd", "poses.npz", *(f"{name}.log" for name in pids)):
         assert (tmp_path / name).stat().st_size > 0, name
-    poses = load_poses(tmp_path / "poses.npz")
+    poses = Poses.load(tmp_path / "poses.npz")
     assert poses.marker_count == 8
     assert (np.diff(poses.t_ns) > 0).all()
     assert (poses.t_ns > killed_ns).sum() > 5, "the hand is tracked by what is left"

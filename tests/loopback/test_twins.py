@@ -35,7 +35,7 @@ def test_of_two_with_one_name_the_first_keeps_its_session_and_both_sides_say_so(
     assert len(taken) == 250
     assert not duplicate.started
     assert master.refused[Refusal.DUPLICATE_SENDER] > 50  # it says hello again and again
-    assert set(master.rejected_peers.duplicates(wires.clock.now_ns())) == {"left"}
+    assert set(master.rejected_peers.lately("duplicate", wires.clock.now_ns())) == {"left"}
     assert duplicate.refused[Refusal.DUPLICATE_SENDER] > 10
     assert duplicate.wrong is not None
     assert "'left'" in duplicate.wrong
@@ -57,10 +57,10 @@ def test_the_second_is_taken_as_soon_as_the_first_is_silent_and_then_keeps_it() 
     assert set(taken) == {duplicate.process}
     assert left.wrong is not None
     assert duplicate.wrong is None
-    assert not master.rejected_peers.versions(wires.clock.now_ns())
+    assert not master.rejected_peers.lately("version", wires.clock.now_ns())
     wires.remove(left)
     wires.run(3.0)
-    assert not master.rejected_peers.duplicates(wires.clock.now_ns())
+    assert not master.rejected_peers.lately("duplicate", wires.clock.now_ns())
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -83,7 +83,7 @@ def test_of_two_that_came_at_once_the_other_is_taken_when_the_first_is_gone(seed
     taken = stream(wires, *pair, seconds=2.0)
     first = next(slave for slave in pair if slave.process == taken[-1])
     wires.remove(first)
-    assert wires.run(6.0, lambda: master.restarts_of("left") > 0)
+    assert wires.run(6.0, lambda: master.events_of("left")["restarts"] > 0)
 
 
 class Versions:
@@ -123,14 +123,14 @@ def test_a_slave_of_another_wire_version_is_named_on_both_sides(monkeypatch: pyt
     now_ns = both.wires.clock.now_ns()
     assert both.hellos == 5  # once a second
     assert both.master.refused == {Refusal.VERSION: 5}
-    ((name, away),) = both.master.rejected_peers.versions(now_ns).items()
+    ((name, away),) = both.master.rejected_peers.lately("version", now_ns).items()
     assert (name, away.version) == ("left", OTHER)
     assert both.slave.refused[Refusal.VERSION] == 50  # beacons
     assert both.slave.wrong is not None
     assert f"wire version {WIRE_VERSION}" in both.slave.wrong
     assert not both.master.connected()
     both.wires.clock.t_ns += 2_000_000_000
-    assert not both.master.rejected_peers.versions(both.wires.clock.now_ns())
+    assert not both.master.rejected_peers.lately("version", both.wires.clock.now_ns())
 
 
 def test_only_a_hello_of_this_rig_makes_a_name_known(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,7 +141,7 @@ def test_only_a_hello_of_this_rig_makes_a_name_known(monkeypatch: pytest.MonkeyP
     hello = HEADER.pack(b"PHLX", OTHER, Kind.HELLO, 100, both.master._keys.rig_tag, 7, 7) + bytes(72)
     for datagram in (hello, hello[:20], hello[:28], b"PHLX" + bytes([OTHER]) + bytes(60)):
         both.master.receive(datagram, ("6.6.6.6", 6), now_ns)
-    assert not both.master.rejected_peers.versions(now_ns)
+    assert not both.master.rejected_peers.lately("version", now_ns)
     assert both.master.refused[Refusal.VERSION] >= 3
     slave = both.slave
     forged = HEADER.pack(

@@ -17,7 +17,7 @@ from common.calibration import HandProfile, load
 from common.recording.frame_recording import open_recording
 from common.sim.record import record_scene
 from common.sim.scene import Scene
-from master.outputs.poses import load_poses
+from master.outputs.poses import Poses
 from master.replay.offline import solve
 from master.rig.setup import RigSetup, load_hand, load_setup
 from slave.commands.offline import detect_recording, save_detections
@@ -86,8 +86,8 @@ def replayed(folder: Path, tree: Path) -> Float:
     rig = opened.manifest.rig_named(None)
     for camera in rig.cameras:
         save_detections(out / f"detections_{camera}.npz", detect_recording(folder, camera, tree))
-    solve(opened, RigSetup.of(rig, opened.manifest.cameras, load_hand(tree, rig.hand, None)), out, out)
-    return load_poses(out / "poses.npz").markers_raw_m
+    solve(opened, [RigSetup.of(rig, opened.manifest.cameras, load_hand(tree, rig.hand, None))], out, out)
+    return Poses.load(out / "poses.npz").markers_raw_m
 
 
 def apart(recorded: Recorded, places: Float) -> Bool:

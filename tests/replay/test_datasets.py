@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from common.arrays import Bool, Float
-from master.outputs.poses import load_poses
+from master.outputs.poses import Poses
 
 HANDS = ("calib_colors", "static", "flex90", "poses_left", "translate_8ms", "lights_0_warm")
 SWEEPS = ("sweep_paper", "sweep_rough")
@@ -132,7 +132,7 @@ def test_a_planted_wrong_blob_is_noticed(replays: dict[str, Replay]) -> None:
 @pytest.mark.parametrize("name", [*HANDS, *SWEEPS])
 def test_caps_are_within_two_and_a_half_millimetres(replays: dict[str, Replay], name: str) -> None:
     replayed = replays[name]
-    truth, raw = replayed.truth(), load_poses(replayed.out / "poses.npz").markers_raw_m
+    truth, raw = replayed.truth(), Poses.load(replayed.out / "poses.npz").markers_raw_m
     _, _, frac, _ = seen_and_true(replayed)
     clear = (frac >= 0.5).all(axis=1)
     centroid = truth["center"][:, None] if "depth" in truth else truth["paint_centroid"]
@@ -150,7 +150,7 @@ def test_joints_of_visible_fingers_are_within_five_millimetres(replays: dict[str
     # Of the six unrelated poses hardly two tips show in one frame; two more are slivers that are not found.
     assert summary["pip_deg_visible"] <= (7.0 if name == "poses_left" else 6.0)
     # The score against our own sum: fingers clear in both cameras, and the wrist.
-    truth, poses = replayed.truth(), load_poses(replayed.out / "poses.npz")
+    truth, poses = replayed.truth(), Poses.load(replayed.out / "poses.npz")
     _, _, frac, _ = seen_and_true(replayed)
     clear = np.asarray((frac >= 0.5).all(axis=1))
     fingers = np.repeat(np.arange(5), [4, 5, 5, 5, 5])
@@ -162,7 +162,7 @@ def test_joints_of_visible_fingers_are_within_five_millimetres(replays: dict[str
 
 @pytest.mark.parametrize("name", HANDS)
 def test_a_pose_for_every_frame_of_the_reference_camera(replays: dict[str, Replay], name: str) -> None:
-    poses, left = load_poses(replays[name].out / "poses.npz"), replays[name].detections("left")
+    poses, left = Poses.load(replays[name].out / "poses.npz"), replays[name].detections("left")
     assert len(poses) == len(left["t_ns"])
     assert (np.diff(poses.t_ns) > 0).all()
     model_ok = np.isfinite(poses.position_m).all(axis=(1, 2))

@@ -18,7 +18,7 @@ import pytest
 
 from common.calibration import RigCalibration, load
 from common.recording.frame_recording import open_recording
-from master.outputs.poses import load_poses
+from master.outputs.poses import Poses
 from master.replay.offline import solve
 from master.rig.setup import RigSetup, load_hand
 
@@ -125,8 +125,8 @@ def test_every_depth_model_of_the_running_line_is_as_good_as_its_calibration(
 
     def percent(model: str) -> np.ndarray:
         chosen = msgspec.structs.replace(rig, depth_model=model)
-        solve(recording, RigSetup.of(chosen, recording.manifest.cameras, hand), sweep.found, tmp_path)
-        found_m = load_poses(tmp_path / "poses.npz").markers_raw_m[:, rig.markers.index("middle"), 2]
+        solve(recording, [RigSetup.of(chosen, recording.manifest.cameras, hand)], sweep.found, tmp_path)
+        found_m = Poses.load(tmp_path / "poses.npz").markers_raw_m[:, rig.markers.index("middle"), 2]
         return 100.0 * np.abs(found_m / true_m - 1.0)
 
     stereo = percent("stereo")

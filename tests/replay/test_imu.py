@@ -24,7 +24,7 @@ from common.recording.frame_recording import open_recording
 from common.sim.record import record_scene
 from common.sim.scene import Scene
 from master.commands.summary import read_summary
-from master.outputs.poses import load_poses
+from master.outputs.poses import Poses
 from master.replay.offline import solve
 from master.rig.setup import RigSetup, load_setup
 from slave.commands.offline import detect_recording, save_detections
@@ -49,11 +49,11 @@ class Recorded:
         """Rotation vectors (T, 3) [deg], rig axes, by which the palm is wrong, where the rig says `imu`."""
         out.mkdir()
         setup = replace(self.setup, rig=msgspec.structs.replace(self.setup.rig, imu=imu))
-        solve(open_recording(folder or self.folder), setup, self.detections, out)
+        solve(open_recording(folder or self.folder), [setup], self.detections, out)
         return self.errors(out)
 
     def errors(self, out: Path) -> Float:
-        poses = load_poses(out / "poses.npz")
+        poses = Poses.load(out / "poses.npz")
         with np.load(self.folder / "truth.npz") as truth:
             T_palm = truth["T_palm"]
         found = quaternion_to_matrix(poses.orientation_wxyz[:, WRIST])

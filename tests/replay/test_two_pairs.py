@@ -15,7 +15,7 @@ from common.sim.record import record_scene
 from common.sim.scene import view_centre
 from common.sim.scenes import scene_by_name
 from master.commands.summary import read_summary
-from master.outputs.poses import load_poses
+from master.outputs.poses import Poses
 from master.replay.offline import solve
 from master.rig.setup import RigSetup, load_setup
 from tests.replay.test_datasets import command
@@ -62,21 +62,21 @@ def test_four_cameras_are_replayed_with_the_hidden_tips_placed(pointing: Replaye
     assert summary["camera_hz"] == dict.fromkeys(pointing.setup.rig.cameras, RATE_HZ)
     assert isinstance(summary["joint_mm"], float)
     assert summary["joint_mm"] < 5.0
-    poses = load_poses(pointing.out / "poses.npz")
+    poses = Poses.load(pointing.out / "poses.npz")
     assert poses.valid[5:].all()
 
 
 def test_one_pair_of_the_same_recording_knows_the_hand_less_well(pointing: Replayed, tmp_path: Path) -> None:
-    setup, both = pointing.setup, load_poses(pointing.out / "poses.npz")
+    setup, both = pointing.setup, Poses.load(pointing.out / "poses.npz")
     pair = RigSetup.of(
         msgspec.structs.replace(setup.rig, cameras=("left", "right")), setup.cameras, setup.hand
     )
-    alone = solve(open_recording(pointing.folder), pair, pointing.out, tmp_path)
+    alone = solve(open_recording(pointing.folder), [pair], pointing.out, tmp_path)
     four = read_summary(pointing.out / "summary.json")
     assert isinstance(alone["joint_mm"], float)
     assert isinstance(four["joint_mm"], float)
     assert four["joint_mm"] < 0.7 * alone["joint_mm"]
-    one = load_poses(tmp_path / "poses.npz")
+    one = Poses.load(tmp_path / "poses.npz")
     found = [np.isfinite(poses.markers_raw_m[:, :5]).all(axis=2).mean() for poses in (one, both)]
     assert found[0] < 0.4
     assert found[1] > 0.8

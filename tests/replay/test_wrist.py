@@ -16,7 +16,7 @@ import pytest
 from common.arrays import Float
 from common.hand.model import FINGERS
 from common.recording.frame_recording import FrameRecording, Illumination, open_recording
-from master.outputs.poses import load_poses
+from master.outputs.poses import Poses
 from master.replay.offline import solve
 from master.rig.setup import RigSetup, load_hand
 from tests.replay.test_datasets import command
@@ -71,7 +71,7 @@ def test_every_cycle_becomes_a_pose(replays: dict[str, Replay], name: str) -> No
     summary, count = replays[name].summary, len(replays[name].truth()["angles"])
     assert summary["poses"] == count
     assert summary["cycles_missed"] == summary["lost"] == 0
-    poses = load_poses(replays[name].out / "poses.npz")
+    poses = Poses.load(replays[name].out / "poses.npz")
     assert poses.marker_count == 0
     assert (np.diff(poses.t_ns) > 0).all()
 
@@ -151,7 +151,7 @@ def test_beyond_the_point_where_the_laser_stands_still_the_output_says_so(
 ) -> None:
     laser = by_laser_alone(replays["curl"], root, tmp_path)
     for replay in (laser, replays["curl"]):
-        poses, truth = load_poses(replay.out / "poses.npz"), replay.truth()
+        poses, truth = Poses.load(replay.out / "poses.npz"), replay.truth()
         pip, tip = truth["angles"][:, [7, 11, 15, 19]], [10, 15, 20, 25]
         spread = np.sqrt(np.trace(poses.cov_m2[:, tip], axis1=2, axis2=3))
         bent, open_ = pip > np.radians(100.0), pip < np.radians(70.0)
@@ -198,7 +198,7 @@ def test_of_exact_detections_the_master_leaves_nothing(datasets: Path, tmp_path:
     rig = recording.manifest.wrist_rig()
     hand = load_hand(None, rig.hand, datasets / "hands" / f"webxr-{HANDS[name]}.json")
     setup = RigSetup.of(rig, recording.manifest.cameras, hand)
-    summary = solve(recording, setup, write_exact(recording, setup, tmp_path), tmp_path)
+    summary = solve(recording, [setup], write_exact(recording, setup, tmp_path), tmp_path)
     assert isinstance(summary["laser_mm"], float)
     assert summary["laser_mm"] < 0.02  # a ray through the true centroid meets the plane in the true point
     assert summary["laser_right"] == 1.0

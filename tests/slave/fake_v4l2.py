@@ -133,8 +133,8 @@ def colour(number: int) -> tuple[int, int, int]:
     return (40 + 8 * (number % 20), 90, 200)
 
 
-class FakeDevice:
-    """An `abi.Device`."""
+class FakeDevice(abi.KernelDevice):
+    """A device without a kernel."""
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera

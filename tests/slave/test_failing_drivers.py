@@ -20,12 +20,10 @@ from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
 from slave.markers.detector import Detections
-from slave.markers.reloadable import NullDetector
-from slave.reconnect import CONTRAST, Backoff, ReconnectingCamera, RepeatedPictures
+from slave.reconnect import CONTRAST, ReconnectingCamera, RepeatedPictures
 from slave.report import DetectionCounters
 from slave.sender import MarkerPipeline, WristPipeline, run
 from slave.sources import LOG_EVERY_NS, Failures, Frame, FrameSource
-from slave.wrist.detector import NullWristDetector
 from tests.slave.fake_picamera2 import OV7251, Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice
 
@@ -44,9 +42,6 @@ MONO = replace(FILE, colour_gains=(1.0, 1.0))
 CODES = {"gain": 32, "white_balance_temperature": 4600}
 GREY = {"GREY": {(640, 480): (30.0,)}}
 CLOCK = SystemClock()
-
-
-QUICK = Backoff(first_s=0.001)
 
 
 class Wire:
@@ -74,7 +69,7 @@ def camera_of(
     opener: Callable[[CameraCalibration], FrameSource], stop: threading.Event
 ) -> ReconnectingCamera:
     """A camera that is lost after 30 ms of one picture, and for which nothing is waited for long."""
-    return ReconnectingCamera(opener, FILE, CLOCK, stop, backoff=QUICK, frozen_s=0.03)
+    return ReconnectingCamera(opener, FILE, CLOCK, stop, first_s=0.001, frozen_s=0.03)
 
 
 def tracked(
@@ -87,7 +82,12 @@ def tracked(
     run(
         source,
         MarkerPipeline(
-            "left", wire.session, wire.send, NullDetector(6).push, DetectionCounters(("a",) * 6), shown.append
+            "left",
+            wire.session,
+            wire.send,
+            lambda _image, _t_ns: Detections.none(6),
+            DetectionCounters(("a",) * 6),
+            shown.append,
         ),
         stop,
     )
@@ -186,7 +186,7 @@ def test_a_camera_that_stays_frozen_is_never_measured_again() -> None:
             "left",
             77,
             Wire(stop, 1).send,
-            NullWristDetector().push,
+            lambda _frame: None,
             counters,
             lambda _frame: stop.set(),
         ),
@@ -238,18 +238,17 @@ def test_a_driver_that_hands_the_same_buffers_round_is_found_in_the_third_turn(b
     assert found == [False] * (2 * buffers) + [True] * (2 * buffers)
 
 
-class Failing(NullDetector):
+class Failing:
     """A detector that raises in some frames."""
 
     def __init__(self, fails: frozenset[int]) -> None:
-        super().__init__(1)
         self._count, self._fails = 0, fails
 
     def push(self, image: Image, t_ns: int) -> Detections:
         self._count += 1
         if self._count in self._fails:
             raise IndexError("a fault in the detector")
-        return super().push(image, t_ns)
+        return Detections.none(1)
 
 
 def test_a_frame_that_the_detector_fails_of_is_dropped_and_counted(caplog: pytest.LogCaptureFixture) -> None:
@@ -276,7 +275,13 @@ def test_what_shows_or_finds_tags_costs_no_detection() -> None:
     stop = threading.Event()
     source = usb(Camera(formats=GREY), FILE)
     wire, counters = Wire(stop, 10), DetectionCounters(("a",))
-    run(source, MarkerPipeline("left", wire.session, wire.send, NullDetector(1).push, counters, fail), stop)
+    run(
+        source,
+        MarkerPipeline(
+            "left", wire.session, wire.send, lambda _image, _t_ns: Detections.none(1), counters, fail
+        ),
+        stop,
+    )
     source.close()
     counts = counters.counts()
     assert (counts["frames"], counts["failed"], len(wire.sent)) == (10, 10, 10)

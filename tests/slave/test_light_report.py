@@ -10,7 +10,7 @@ from common.arrays import Float
 from slave.live import LightReport
 from slave.markers.reloadable import ReloadableDetector
 from slave.markers.white_balance import ColourWarning
-from slave.sources import Frame, Reporting
+from slave.sources import Frame
 
 SECOND = 1_000_000_000
 IMAGE = np.zeros((2, 2, 3), np.uint8)
@@ -23,16 +23,8 @@ class Detector:
         self.warnings: list[ColourWarning] = []
         self.log_gains: Float = np.log([0.5, 1.25, 2.5])
         self.refused = 3
-        self.adapts = True
+        self.adaptive: Detector | None = self
         self.tables = 4
-
-
-class Others(Reporting):
-    def counts(self) -> dict[str, int]:
-        return {"frames": 7}
-
-    def metrics(self) -> dict[str, float]:
-        return {"rate_hz": 60.0}
 
 
 def frame(t_s: float) -> Frame:
@@ -41,7 +33,7 @@ def frame(t_s: float) -> Frame:
 
 def report() -> tuple[Detector, LightReport]:
     detector = Detector()
-    return detector, LightReport("left", cast(ReloadableDetector, detector), Others(), ("thumb", "index"))
+    return detector, LightReport("left", cast(ReloadableDetector, detector), ("thumb", "index"))
 
 
 def test_a_warning_is_counted_when_it_begins() -> None:
@@ -51,7 +43,7 @@ def test_a_warning_is_counted_when_it_begins() -> None:
         light.offer(frame(0.1 * k))
     counts = light.counts()
     assert (counts["warnings.thumb"], counts["warnings.index"], counts["warnings.light"]) == (2, 0, 1)
-    assert (counts["frames"], counts["refused.light"], counts["colour_tables"]) == (7, 3, 4)
+    assert (counts["refused.light"], counts["colour_tables"]) == (3, 4)
 
 
 def test_the_log_names_marker_and_fix_and_is_quiet_for_a_while(caplog: pytest.LogCaptureFixture) -> None:
@@ -68,12 +60,10 @@ def test_the_log_names_marker_and_fix_and_is_quiet_for_a_while(caplog: pytest.Lo
 
 def test_the_gauges_are_the_light_against_calibration() -> None:
     metrics = report()[1].metrics()
-    assert metrics == pytest.approx(
-        {"rate_hz": 60.0, "light_red": 2.0, "light_blue": 0.4, "light_exposure": 1.25}
-    )
+    assert metrics == pytest.approx({"light_red": 2.0, "light_blue": 0.4, "light_exposure": 1.25})
 
 
 def test_of_a_light_that_is_not_followed_nothing_is_said() -> None:
     detector, light = report()
-    detector.adapts = False
-    assert light.metrics() == {"rate_hz": 60.0}
+    detector.adaptive = None
+    assert light.metrics() == {}

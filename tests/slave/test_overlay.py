@@ -6,15 +6,15 @@ import pytest
 from msgspec.structs import replace
 
 from common.arrays import Image
-from common.bus.bus import LoopbackBus
 from common.calibration import HsvRange
 from common.errors import CalibrationError
 from common.messages import Command, Preview
-from common.messages.command_bodies import PreviewWish
+from common.messages.command_bodies import PreviewRequest
 from slave.markers.detector import MarkerDetector
 from slave.markers.reloadable import CalibratedDetector, ReloadableDetector
 from slave.preview import ARM_PX, SEVERAL, MarkerOverlay, Previews, WristOverlay, contrast_of
 from slave.sources import Frame
+from tests.memory_bus import LoopbackBus
 from tests.network_helpers import ManualClock
 from tests.slave import painted
 from tests.slave.painted import NAMES
@@ -132,7 +132,7 @@ def test_each_viewer_sees_what_all_have_wished_for_in_the_last_three_seconds() -
 
 
 def test_a_body_is_read_as_it_was_written() -> None:
-    for wish in (PreviewWish(), PreviewWish(mask=("index",)), PreviewWish(found=True)):
-        command = Command("left", "preview", wish.body())
-        assert PreviewWish.of(command.body) == wish
-    assert PreviewWish().body() == ""
+    for request in (PreviewRequest(), PreviewRequest(mask=("index",)), PreviewRequest(found=True)):
+        command = Command("left", "preview", request.body())
+        assert PreviewRequest.of(command.body) == request
+    assert PreviewRequest().body() == ""

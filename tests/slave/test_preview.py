@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.arrays import Image
-from common.bus.bus import LoopbackBus
 from common.errors import BusError
 from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Command, Message, Preview, Still
 from slave import preview
@@ -21,6 +20,7 @@ from slave.report import DetectionCounters, Reporter
 from slave.sender import MarkerPipeline, run
 from slave.sources import Frame
 from slave.uplink import Uplink
+from tests.memory_bus import LoopbackBus
 from tests.network_helpers import ManualClock, until
 from tests.slave.painted import NAMES, camera, hand, render
 from tests.slave.test_sender import Source, Wire

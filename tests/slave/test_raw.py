@@ -12,18 +12,17 @@ import msgspec
 import numpy as np
 import pytest
 
-from common.bus.bus import LoopbackBus
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.clock import SystemClock
 from common.errors import BusError, CalibrationError
 from common.messages import Command, Health
-from common.messages.command_bodies import RawWish, raw_name
+from common.messages.command_bodies import RawRequest, raw_name
 from common.recording.frame_recording import open_recording
 from slave import raw
 from slave.__main__ import main
 from slave.commands.join import join_recordings
 from slave.commands.offline import detect_recording
-from slave.markers.reloadable import NullDetector
+from slave.markers.detector import Detections
 from slave.raw import RawFrames, RawSettings
 from slave.report import DetectionCounters, Reporter
 from slave.sender import MarkerPipeline, run
@@ -31,6 +30,7 @@ from slave.sources import Frame
 from slave.tuning import CameraFiles
 from slave.uplink import Uplink
 from tests.common.recording.test_frame_writing import check_whole
+from tests.memory_bus import LoopbackBus
 from tests.network_helpers import until
 from tests.slave.test_recorder import ListCamera
 from tests.slave.test_tuning import Wire
@@ -70,7 +70,9 @@ class Slave:
         source = self.raw.reading(ListCamera(given))
         run(
             source,
-            MarkerPipeline(self.name, 77, Wire().send, NullDetector(6).push, self.counters),
+            MarkerPipeline(
+                self.name, 77, Wire().send, lambda _image, _t_ns: Detections.none(6), self.counters
+            ),
             threading.Event(),
         )
 
@@ -78,7 +80,7 @@ class Slave:
         return self.bus.ask(Command(self.name, verb, body), 10.0)
 
     def begin(self, name: str, lease_s: float = 0.0) -> Health:
-        return self.ask("raw", RawWish(name=name, lease_s=lease_s).body())
+        return self.ask("raw", RawRequest(name=name, lease_s=lease_s).body())
 
     def close(self) -> None:
         self.reporter.close()
@@ -169,7 +171,7 @@ def test_it_says_why_it_does_not_begin(calibration: Path, tmp_path: Path) -> Non
     with slave(tree, tmp_path) as left:
         for name in ("..", ".hidden", "a/b", "", "x" * 65):
             with pytest.raises(CalibrationError, match="name"):
-                RawWish.of(f'{{"name": "{name}"}}')
+                RawRequest.of(f'{{"name": "{name}"}}')
         with pytest.raises(BusError, match=r"files of all cameras of rig 'desk': .*right\.json"):
             left.begin("wave")
         with pytest.raises(BusError, match="raw_stop: takes no body"):

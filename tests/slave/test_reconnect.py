@@ -14,7 +14,7 @@ from common.clock import Clock
 from common.errors import CameraError, ImuError, PhalanxError, TrackerChoiceError, TrackerError
 from common.messages import ImuSample, TrackerPose
 from slave import sources
-from slave.reconnect import Backoff, ReconnectingCamera, ReconnectingDriver, ReconnectingTracker
+from slave.reconnect import ReconnectingCamera, ReconnectingDriver, ReconnectingTracker
 from slave.sources import LOG_EVERY_NS, Frame, Reporting
 
 CALIBRATION = CameraCalibration(
@@ -127,14 +127,14 @@ class TrackerDriver(Plain):
 
 def driver(device: str, bench: Bench, stop: threading.Event | None = None) -> Driver:
     """A reconnecting driver; the longest wait of each is a second here."""
-    stop, back = Stop(bench) if stop is None else stop, Backoff(longest_s=1.0)
+    stop = Stop(bench) if stop is None else stop
     bench.error = {"camera": CameraError, "IMU": ImuError, "tracker": TrackerError}[device]
     rest = bench, stop, bench.connection_lost
     if device == "camera":
-        return ReconnectingCamera(lambda _file: CameraDriver(bench), CALIBRATION, *rest, backoff=back)
+        return ReconnectingCamera(lambda _file: CameraDriver(bench), CALIBRATION, *rest, longest_s=1.0)
     if device == "IMU":
-        return ReconnectingDriver("IMU", lambda: ImuDriver(bench), *rest, rate_hz=50.0, backoff=back)
-    return ReconnectingTracker("wand", lambda: TrackerDriver(bench), *rest, backoff=back)
+        return ReconnectingDriver("IMU", lambda: ImuDriver(bench), *rest, rate_hz=50.0, longest_s=1.0)
+    return ReconnectingTracker("wand", lambda: TrackerDriver(bench), *rest, longest_s=1.0)
 
 
 def measured(source: Driver) -> Iterator[Item]:

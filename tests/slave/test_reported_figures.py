@@ -5,7 +5,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import cast
 
-from common.bus.bus import LoopbackBus
 from common.bus.keys import Access
 from common.calibration.camera_settings import WANTED, figures
 from common.clock import SystemClock
@@ -18,6 +17,7 @@ from slave.sender import Sender
 from slave.service import Service
 from slave.tuning import CameraTuning
 from slave.uplink import Uplink
+from tests.memory_bus import LoopbackBus
 from tests.network_helpers import until
 from tests.slave.test_tuning import FILE, RIG, Knobs, Wire, tree
 
@@ -49,10 +49,16 @@ def test_a_slave_reports_what_the_checklist_judges(tmp_path: Path) -> None:
     sender = Sender("left", uplink, clock, stop, lambda _line: None, Service({}), cast(Access, None))
     with ThreadPoolExecutor(1) as workers:
         line = live._marker_line(sender, files, "follow", "full", NUMPY, workers)
-    assert line.reported is not None
     tuning = CameraTuning(files, Camera(), line.prepare, lambda: True, line.sample)
     reporter = Reporter(
-        "left", uplink, line.reported, clock, lambda _: LoopbackBus(), stop.set, 0.01, parts=(tuning,)
+        "left",
+        uplink,
+        line.pipeline.counters,
+        clock,
+        lambda _: LoopbackBus(),
+        stop.set,
+        0.01,
+        parts=(tuning,),
     )
 
     def ask(verb: str, body: str = "") -> Health:

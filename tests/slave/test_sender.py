@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from common.bus.bus import LoopbackBus
 from common.clock import SystemClock
 from common.errors import BusError, CameraError
 from common.messages import Command, Health, MarkerDetections, Message
@@ -14,6 +13,7 @@ from slave.report import ALONE_AT, DetectionCounters, Reporter
 from slave.sender import MarkerPipeline, run, wait_for_start
 from slave.sources import Frame
 from slave.uplink import Uplink
+from tests.memory_bus import LoopbackBus
 from tests.slave.painted import CENTRES, NAMES, camera, hand, render
 
 DETECTOR = MarkerDetector(camera(), NAMES)

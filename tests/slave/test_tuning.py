@@ -11,7 +11,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from common.bus.bus import LoopbackBus
 from common.calibration import CameraCalibration, HandProfile, HsvRange, RigCalibration, load, save
 from common.clock import SystemClock
 from common.errors import BusError, CalibrationError, CameraError
@@ -28,6 +27,7 @@ from slave.sender import MarkerPipeline, run
 from slave.sources import Frame, Tunable
 from slave.tuning import CameraFiles, CameraTuning
 from slave.uplink import Uplink
+from tests.memory_bus import LoopbackBus
 from tests.network_helpers import until
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -340,12 +340,14 @@ def test_a_new_calibration_goes_over_the_bus_into_the_running_slave_and_its_file
     with slave(files, scan) as left:
         tables = left.detector
         used = tables._detector
-        track = used._detector._tracks  # pyright: ignore[reportAttributeAccessIssue]
+        assert used.plain is not None
+        track = used.plain._tracks
         health = left.ask("load", text(new))
         assert (health.metrics["exposure_us"], health.metrics["analogue_gain"]) == (4500.0, 1.5)
         assert load(files.camera_path, CameraCalibration) == FILE, "not asked to save"
         assert until(lambda: tables._detector is not used)
-        assert tables._detector._detector._tracks is track, "tracks go on"  # pyright: ignore[reportAttributeAccessIssue]
+        assert tables._detector.plain is not None
+        assert tables._detector.plain._tracks is track, "tracks go on"
         left.ask("save")
         assert load(files.camera_path, CameraCalibration) == new
         assert [path.name for path in files.camera_path.parent.iterdir()] == ["left.json"], (

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, RigCalibration
@@ -21,12 +20,11 @@ from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import rotation_vector_to_matrix
 from common.recording.frame_recording import Illumination, Manifest
-from common.recording.frame_writing import RecordingWriter, encode_png
+from common.recording.recorded_files import write_npz
+from common.sim.light import Float32
+from common.sim.record import FIRST_NS, TRUTH, RenderedFrame, write_frames
+from common.sim.wrist.record import ORDER
 
-Float32 = npt.NDArray[np.float32]
-
-TRUTH = "truth.npz"
-ILLUMINATIONS = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
 WHITE = 0.75  # reflectance at 850 nm
 LED_AT_M = 0.20  # where white paper before the lens fills LED_LEVEL of the range
 LED_LOBE = 1.0  # LEDs behind a diffuser: power of the cosine
@@ -92,7 +90,7 @@ def board_poses(
     rng = np.random.default_rng([seed, 7])
     half = np.array([columns - 1, rows - 1]) * 0.5
     x, y = np.meshgrid([-1.0, columns], [-1.0, rows])
-    rim = (np.stack([x.ravel() - half[0], y.ravel() - half[1], np.zeros(4)], axis=1)) * square_m
+    rim = np.stack([x.ravel() - half[0], y.ravel() - half[1], np.zeros(4)], axis=1) * square_m
     most = np.array([TILT_RAD, TILT_RAD, ROLL_RAD])
     found: list[Float] = []
     for _ in range(500 * count):
@@ -127,15 +125,14 @@ class WristBoardRenderer:
         self._scene = scene
         optics = scene.optics()
         height, width = optics.height_px, optics.width_px
-        u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-        xy = optics.undistort(np.stack([u, v], axis=-1))
+        u, v = np.meshgrid(np.arange(width), np.arange(height))
+        xy = optics.undistort(np.stack([u, v], axis=-1).astype(np.float64))
         down, along = np.gradient(xy, axis=0), np.gradient(xy, axis=1)
-        rays: list[Float32] = []
         fine = 3  # rays per pixel and axis
-        for dv in (np.arange(fine) + 0.5) / fine - 0.5:
-            for du in (np.arange(fine) + 0.5) / fine - 0.5:
-                rays.append(np.moveaxis(xy + du * along + dv * down, -1, 0).astype(np.float32))
-        self._rays = rays
+        part = (np.arange(fine) + 0.5) / fine - 0.5
+        self._rays = [
+            np.moveaxis(xy + du * along + dv * down, -1, 0).astype(np.float32) for dv in part for du in part
+        ]
         self._lens = ((1.0 + (xy**2).sum(axis=-1)) ** (-0.5 * LENS_POWER)).astype(np.float32)
 
     def render(self, pose: int, lit: Illumination) -> Image:
@@ -217,7 +214,7 @@ class WristBoardRenderer:
         """Image of the sensor: blur of the lens, noise of photons and of reading, 8 bits."""
         lens_sigma_px = 0.55
         blurred = np.asarray(cv2.GaussianBlur(light, (5, 5), lens_sigma_px), np.float64)
-        rng = np.random.default_rng([self._scene.seed, pose, ILLUMINATIONS.index(lit)])
+        rng = np.random.default_rng([self._scene.seed, pose, ORDER.index(lit)])
         black_level, full = 2.0, 255.0
         level = black_level + (full - black_level) * blurred
         read_sigma, electrons = 0.7, 40.0  # levels; electrons per level
@@ -229,7 +226,7 @@ def record_wrist_board(
     folder: Path,
     scene: WristBoardScene,
     rig: RigCalibration | None = None,
-    illuminations: tuple[Illumination, ...] = ILLUMINATIONS,
+    illuminations: tuple[Illumination, ...] = ORDER,
 ) -> int:
     """Render every pose as one strobe cycle and return the number of poses.
 
@@ -251,16 +248,19 @@ def record_wrist_board(
         continuous=False,
         note=f"board of {scene.columns} x {scene.rows} inner corners, {1e3 * scene.square_m:g} mm; one pose per cycle",
     )
-    writer = RecordingWriter(folder, manifest)
-    try:
-        for pose in range(len(scene.poses)):
-            for k, lit in enumerate(ILLUMINATIONS):
-                if lit not in illuminations:
-                    continue
-                first_ns, period_ns, held_ns = 10**9, 11_111_111, 500_000_000
-                t_ns = first_ns + pose * held_ns + k * period_ns
-                writer.add(scene.camera.name, 3 * pose + k, t_ns, lit, encode_png(renderer.render(pose, lit)))
-    finally:
-        writer.close()
-    np.savez(folder / TRUTH, T_camera_board=scene.poses)
-    return len(scene.poses)
+    period_ns, held_ns, poses = 11_111_111, 500_000_000, len(scene.poses)
+    frames = (
+        RenderedFrame(
+            scene.camera.name,
+            3 * pose + k,
+            FIRST_NS + pose * held_ns + k * period_ns,
+            lit,
+            renderer.render(pose, lit),
+        )
+        for pose in range(poses)
+        for k, lit in enumerate(ORDER)
+        if lit in illuminations
+    )
+    write_frames(folder, manifest, frames)
+    write_npz(folder / TRUTH, {"T_camera_board": scene.poses})
+    return poses

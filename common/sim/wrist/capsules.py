@@ -9,7 +9,7 @@ the hand, matt and dark: they hide what is behind them from the camera, and keep
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -69,19 +69,11 @@ class HandCapsules:
             parts += _finger(model, radius, finger, rng)
             tips.append(len(parts) - 1)
         parts += _thenar(model, radius, rng)
-        return cls(
-            joint=np.array([part.joint for part in parts]),
-            start=np.array([part.start for part in parts]),
-            stop=np.array([part.stop for part in parts]),
-            start_radius_m=np.array([part.start_radius_m for part in parts]),
-            stop_radius_m=np.array([part.stop_radius_m for part in parts]),
-            group=np.array([part.group for part in parts]),
-            segment=np.array([part.segment for part in parts]),
-            tip=np.array(tips),
-            thumb=np.array([still, still + 2]),  # the phalanx's pad lies between them
-            forearm=forearm,
-            still=still,
-        )
+        columns: dict[str, Any] = {
+            name: np.array([getattr(part, name) for part in parts]) for name in _Part._fields
+        }
+        thumb = np.array([still, still + 2])  # the phalanx's pad lies between them
+        return cls(**columns, tip=np.array(tips), thumb=thumb, forearm=forearm, still=still)
 
     def bodies(self, joints: HandJoints, R_straight: Float | None = None) -> Capsules:
         """Return the bodies in the frame of the joints.
@@ -164,10 +156,8 @@ def _thenar(model: HandModel, radius: list[float], rng: np.random.Generator) -> 
     ball = rng.uniform(0.95, 1.1) * radius[near]
     # Across the palm: towards the middle finger, in the frame of the thumb's metacarpal.
     inward = model.rest_rotation[near].T @ np.array([-model.side_sign, 0.0, 0.0])
-    side, deep = (
-        0.009 * inward + np.array([0.0, rng.uniform(-0.003, -0.001), 0.0]),
-        np.array([0.0, 0.004, 0.0]),
-    )
+    side = 0.009 * inward + np.array([0.0, rng.uniform(-0.003, -0.001), 0.0])
+    deep = np.array([0.0, 0.004, 0.0])
     ends = (
         (0.05 * bone + side, 0.62 * bone + 0.6 * side, ball, 0.85 * ball),
         (0.1 * bone + 1.8 * side, 0.75 * bone + 1.5 * side, 0.9 * ball, 0.65 * ball),
@@ -186,20 +176,16 @@ def _palm(model: HandModel, radius: list[float], rng: np.random.Generator) -> li
 
     def add(start: Float, stop: Float, r1: float, r2: float) -> None:
         # The frame of the wrist's joint is turned to the palm's, and does not move in it.
-        out.append(
-            _Part(
-                WRIST, wrist_rotation.T @ start, wrist_rotation.T @ stop, float(r1), float(r2), PALM_GROUP, 0
-            )
-        )
+        ends = wrist_rotation.T @ start, wrist_rotation.T @ stop
+        out.append(_Part(WRIST, *ends, float(r1), float(r2), PALM_GROUP, 0))
 
     for k in range(4):
         add(bases[k], heads[k], base_m[k], head_m[k])
     mound, web = np.array([0.0, -rng.uniform(0.002, 0.004), -0.004]), np.array([0.0, -0.001, 0.009])
     for k in range(3):
         j = k + 1
-        add(
-            0.5 * (bases[k] + bases[j]), 0.5 * (heads[k] + heads[j]), 0.5 * (base_m[k] + base_m[j]), head_m[k]
-        )
+        base, head = 0.5 * (bases[k] + bases[j]), 0.5 * (heads[k] + heads[j])
+        add(base, head, 0.5 * (base_m[k] + base_m[j]), head_m[k])
         add(heads[k] + mound, heads[j] + mound, 0.87 * head_m[k], 0.87 * head_m[j])
         add(heads[k] + web, heads[j] + web, 0.75 * head_m[k], 0.75 * head_m[j])
     thick = -rng.uniform(0.003, 0.006)
@@ -221,24 +207,13 @@ def bodies_of(things: Sequence[Cylinder], T_camera_rig: Float) -> Capsules:
     Raises:
         ValueError: One is wider than long; it would be a ball.
     """
-    start, stop, radius = [np.empty((0, 3))], [np.empty((0, 3))], np.array([one.radius_m for one in things])
     for one in things:
         if one.length_m < 2.0 * one.radius_m:
             raise ValueError(
                 f"cylinder of {one.length_m} m: shorter than its width of {2.0 * one.radius_m} m"
             )
-        T = T_camera_rig @ one.T_rig_object
-        half = (0.5 * one.length_m - 2.0 / 3.0 * one.radius_m) * T[:3, 2]  # 4/3 pi r^3 are in the ends
-        start.append(T[:3, 3] - half[None])
-        stop.append(T[:3, 3] + half[None])
-    return Capsules(np.concatenate(start), np.concatenate(stop), radius, radius)
-
-
-def with_things(capsules: Capsules, things: Capsules) -> Capsules:
-    """The bodies of the flesh, and after them those of things."""
-    return Capsules(
-        np.concatenate([capsules.start_m, things.start_m]),
-        np.concatenate([capsules.stop_m, things.stop_m]),
-        np.concatenate([capsules.start_radius_m, things.start_radius_m]),
-        np.concatenate([capsules.stop_radius_m, things.stop_radius_m]),
-    )
+    radius = np.array([one.radius_m for one in things])
+    T = np.array([T_camera_rig @ one.T_rig_object for one in things])
+    # 4/3 pi r^3 are in the ends
+    half = (0.5 * np.array([one.length_m for one in things]) - 2.0 / 3.0 * radius)[:, None] * T[:, :3, 2]
+    return Capsules(T[:, :3, 3] - half, T[:, :3, 3] + half, radius, radius)

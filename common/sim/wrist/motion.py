@@ -6,6 +6,7 @@ and the palm never moves in the camera's frame, since the device is strapped to 
 wrist bends, `OnForearm` is what the device feels.
 """
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,119 +15,99 @@ from common.arrays import Float
 from common.geometry.transforms import rigid
 from common.hand.model import HandModel
 from common.hand.wrist import STRAIGHT, forearm_palm
+from common.sim.grasp import MCP_PER_PIP
 from common.sim.motion import (
     FIST,
     PERIOD_S,
     POSES,
     REST,
-    Drift,
+    DriftingMotion,
     HandMotion,
     HandState,
     angles_of,
     base_pose,
+    between,
+    posture_of,
     smooth_step,
+    station_at,
 )
 
 CURL_S = 10.0  # there and back
 CURL_PIP_DEG = 110.0
-MCP_PER_PIP, DIP_PER_PIP = 0.54, 0.84  # Kamper's ratios, in Kim et al. 2012
+DIP_PER_PIP = 0.84  # Kamper's ratio, in Kim et al. 2012
 SUBJECT_S = 16.0
 KNUCKLES_S, FIST_S = (0.8, 7.2), (8.8, 15.2)  # of the two bends within it, there and back
 WOBBLE = np.radians(1.0)
-THUMB_OPEN_DEG, THUMB_CLOSED_DEG = (-6.0, -4.0, 0.0, 0.0), (-2.0, 18.0, 18.0, 26.0)
+_THUMB_OPEN, _THUMB_CLOSED = np.radians([[-6.0, -4.0, 0.0, 0.0], [-2.0, 18.0, 18.0, 26.0]])
 RANDOM_POSES = 60
 # abduction, MCP, PIP; DIP / PIP
 RANDOM_DEG, RANDOM_DIP = ((-10.0, 10.0), (0.0, 80.0), (0.0, 100.0)), (0.5, 0.9)
 FOREARM_ROTATION = np.radians(12.0)
-_HALF_BENT = ((8, 2, 6), (0, 22, 36), (0, 22, 36), (0, 22, 36), (0, 22, 36))
-_WIDE = ((24, -4, 0), (14, 8, 10), (0, 8, 10), (-12, 8, 10), (-15, 8, 10))
-_CLOSED = ((-6, 4, 6), (-6, 10, 14), (0, 10, 14), (4, 10, 14), (7, 10, 14))
-_ACROSS = ((4, 40, 40), (3, 10, 16), (0, 10, 17), (-4, 11, 18), (-9, 12, 19))
-_HOOK = ((8, 2, 6), (3, 12, 80), (0, 12, 82), (-4, 12, 80), (-9, 12, 76))
+_NONE = np.zeros(3)
+_HALF_BENT = posture_of((8, 2, 6), *[(0, 22, 36)] * 4)
+_WIDE = posture_of((24, -4, 0), (14, 8, 10), (0, 8, 10), (-12, 8, 10), (-15, 8, 10))
+_CLOSED = posture_of((-6, 4, 6), (-6, 10, 14), (0, 10, 14), (4, 10, 14), (7, 10, 14))
+_ACROSS = posture_of((4, 40, 40), (3, 10, 16), (0, 10, 17), (-4, 11, 18), (-9, 12, 19))
+_HOOK = posture_of((8, 2, 6), (3, 12, 80), (0, 12, 82), (-4, 12, 80), (-9, 12, 76))
 
-Posture = tuple[tuple[float, ...], ...]
 
-
-def _alone(finger: int, share: float) -> Posture:
+def _alone(finger: int, share: float) -> Float:
     """One finger closed by a share, the others at rest."""
-    rest, fist = np.array(REST, dtype=np.float64), np.array(FIST, dtype=np.float64)
-    rest[finger] += share * (fist[finger] - rest[finger])
-    return tuple(map(tuple, rest.tolist()))
+    posture = REST.copy()
+    posture[finger] += share * (FIST[finger] - posture[finger])
+    return posture
 
 
-def _swung(degrees: float) -> Posture:
+def _swung(degrees: float) -> Float:
     """Half-bent fingers abducted sideways together, to the thumb if positive."""
-    return tuple((row[0] + (degrees if finger else 0.0), *row[1:]) for finger, row in enumerate(_HALF_BENT))
+    posture = _HALF_BENT.copy()
+    posture[1:, 0] += degrees
+    return posture
 
 
-_STANDARD: tuple[Posture, ...] = (
-    *(
-        REST,
-        FIST,
-        REST,
-        *(_alone(f, 0.9) for f in (1, 2, 3, 4, 0)),
-        _WIDE,
-        _CLOSED,
-        _WIDE,
-        REST,
-        _ACROSS,
-        REST,
-    ),
+_STANDARD = (
+    *(REST, FIST, REST, *(_alone(f, 0.9) for f in (1, 2, 3, 4, 0))),
+    *(_WIDE, _CLOSED, _WIDE, REST, _ACROSS, REST),
     *(*POSES.values(), REST, _HOOK, REST, *(_alone(f, 0.5) for f in (4, 3, 2, 1)), _swung(9.0), _swung(-9.0)),
     *(POSES["pinch"], REST, POSES["pinch"], POSES["large_grasp"], POSES["small_grasp"], REST, FIST),
 )
-_SPREAD: tuple[Posture, ...] = (
-    _HALF_BENT,
-    _WIDE,
-    _CLOSED,
-    *(_swung(d) for d in (10.0, -10.0, 5.0, -5.0)),
-    _CLOSED,
-)
+_SPREAD = (_HALF_BENT, _WIDE, _CLOSED, *(_swung(d) for d in (10.0, -10.0, 5.0, -5.0)), _CLOSED)
 
 
-class Stations:
-    """Sequence of postures in 60 s, and its script."""
+class Stations(DriftingMotion):
+    """Sequence of postures, every one hit nearly, as people do.
+
+    After `period_s` [s] the first comes again; the motion is closed there where that is 60 s.
+    """
 
     def __init__(
-        self, model: HandModel, postures: tuple[Posture, ...], seed: int, period_s: float = PERIOD_S
+        self, model: HandModel, postures: Sequence[Float], seed: int, period_s: float = PERIOD_S
     ) -> None:
-        """Write the script: every posture is hit nearly, as people do.
-
-        `postures` are (5, 3) each [deg]: abduction, flexion, PIP. After `period_s` [s] the first comes again;
-        the motion is closed there where that is 60 s.
-        """
         rng = np.random.default_rng([seed, 11])
-        self._model, self._drift = model, Drift(rng)
+        super().__init__(model, _NONE, rng)
         self._postures = np.array(postures, dtype=np.float64)
         self._postures += rng.normal(0.0, (1.0, 2.5, 4.0), self._postures.shape)
-        self.period_s = period_s
-        self._each_s = period_s / len(postures)
+        self.period_s, self._each_s = period_s, period_s / len(postures)
         move_s = 0.8  # at most: the way from one posture to the next
         self._move_s = min(move_s, 0.7 * self._each_s)
 
-    def at(self, t_s: float) -> HandState:
-        """The hand at time `t_s` [s]; before 0 the pose of 0."""
-        t = max(t_s, 0.0) % self.period_s
-        place = min(int(t / self._each_s), len(self._postures) - 1)
-        share = smooth_step((t - place * self._each_s) / self._move_s)
-        before = self._postures[place - 1]  # that of the first is the last
-        posture = before + share * (self._postures[place] - before)
-        wobble, shift, rotation = self._drift.at(t)
-        return HandState(_forearm(self._model, t, shift, rotation), angles_of(self._model, posture, wobble))
+    def _moved(self, t: float, wobble: Float, shift: Float, rotation: Float) -> HandState:
+        place, since_s = station_at(t, self._each_s, len(self._postures))
+        posture = between(self._postures, place, smooth_step(since_s / self._move_s))
+        pose = _forearm(self._model, t, shift, rotation)
+        return HandState(pose, angles_of(self._model, posture, wobble))
 
 
 class GuidedCurl:
     """All fingers curl slowly from straight to PIP 110 degrees and back.
 
-    MCP and DIP follow the PIP by the ratios of Kim et al. 2012.
+    MCP and DIP follow the PIP by the ratios of Kim et al. 2012; the limits do not clip what they give.
     """
 
     period_s = CURL_S
 
     def __init__(self, model: HandModel) -> None:
-        """Of one hand; its limits do not clip what the ratios give."""
         self._model = model
-        self._open, self._closed = np.radians(THUMB_OPEN_DEG), np.radians(THUMB_CLOSED_DEG)
 
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
@@ -134,9 +115,9 @@ class GuidedCurl:
         share = 0.5 - 0.5 * np.cos(2.0 * np.pi * t / CURL_S)
         pip = share * np.radians(CURL_PIP_DEG)
         angles = np.zeros((5, 4))
-        angles[0] = self._open + share * (self._closed - self._open)
+        angles[0] = _THUMB_OPEN + share * (_THUMB_CLOSED - _THUMB_OPEN)
         angles[1:, 1:] = MCP_PER_PIP * pip, pip, DIP_PER_PIP * pip
-        return HandState(_forearm(self._model, t, np.zeros(3), np.zeros(3)), angles)
+        return HandState(_forearm(self._model, t), angles)
 
 
 class GuidedSubject:
@@ -149,10 +130,8 @@ class GuidedSubject:
     period_s = SUBJECT_S
 
     def __init__(self, model: HandModel, seed: int) -> None:
-        """Of one hand; the same seed, the same person."""
         rng = np.random.default_rng([seed, 13])
         self._model = model
-        self._open, self._closed = np.radians(THUMB_OPEN_DEG), np.radians(THUMB_CLOSED_DEG)
         self._flat = np.radians(rng.normal(0.0, (2.0, 2.0, 2.0, 2.0), (4, 4)))
         knuckle, follows = np.radians(rng.uniform(72.0, 88.0, (4, 1))), rng.uniform(0.0, 0.06, (4, 2))
         self._bent = knuckle * np.concatenate([np.zeros((4, 1)), np.ones((4, 1)), follows], axis=1)
@@ -170,44 +149,42 @@ class GuidedSubject:
         )
         wobble = WOBBLE * np.sin(2.0 * np.pi * self._cycles * t / SUBJECT_S + self._phase)
         angles = np.empty((5, 4))
-        angles[0] = self._open + fist * (self._closed - self._open)
+        angles[0] = _THUMB_OPEN + fist * (_THUMB_CLOSED - _THUMB_OPEN)
         angles[1:] = self._flat + wobble + bend * self._bent + fist * self._fist
-        return HandState(_forearm(self._model, t, np.zeros(3), np.zeros(3)), angles)
+        return HandState(_forearm(self._model, t), angles)
 
 
 class RandomPoses:
-    """Sequence of poses whose joints are independent of each other."""
+    """Sequence of poses whose joints are independent, each held for half of its time.
+
+    They are drawn from `RANDOM_DEG` and `RANDOM_DIP`, and the thumb from its limits.
+    """
 
     period_s = PERIOD_S
 
     def __init__(self, model: HandModel, seed: int) -> None:
-        """Draw poses in `RANDOM_DEG` and `RANDOM_DIP`, and the thumb in its limits."""
         rng = np.random.default_rng([seed, 14])
         self._model = model
         self._angles = np.empty((RANDOM_POSES, 5, 4))
-        share = rng.uniform(0.0, 1.0, (RANDOM_POSES, 4))
-        low, high = model.limits_rad[0].T
-        self._angles[:, 0] = low + share * (high - low)
         of = (RANDOM_POSES, 4)
+        low, high = model.limits_rad[0].T
+        self._angles[:, 0] = low + rng.uniform(0.0, 1.0, of) * (high - low)
         abduction, mcp, pip = (np.radians(rng.uniform(a, b, of)) for a, b in RANDOM_DEG)
         self._angles[:, 1:] = np.stack([abduction, mcp, pip, rng.uniform(*RANDOM_DIP, of) * pip], axis=-1)
 
     def at(self, t_s: float) -> HandState:
-        """The hand at `t_s` [s]; in the second half of each pose's time it stands still."""
+        """The hand at time `t_s` [s]; before 0 the pose of 0."""
         t = max(t_s, 0.0) % PERIOD_S
         each_s = PERIOD_S / RANDOM_POSES
-        place = min(int(t / each_s), RANDOM_POSES - 1)
-        share = smooth_step((t - place * each_s) / (0.5 * each_s))
-        before = self._angles[place - 1]
-        angles = before + share * (self._angles[place] - before)
-        return HandState(_forearm(self._model, t, np.zeros(3), np.zeros(3)), angles)
+        place, since_s = station_at(t, each_s, RANDOM_POSES)
+        angles = between(self._angles, place, smooth_step(since_s / (0.5 * each_s)))
+        return HandState(_forearm(self._model, t), angles)
 
 
 class OnForearm:
     """Motion of the forearm: where the palm would be if the wrist were straight."""
 
     def __init__(self, motion: HandMotion) -> None:
-        """Of a hand."""
         self._motion, self.period_s = motion, motion.period_s
 
     def at(self, t_s: float) -> HandState:
@@ -220,30 +197,31 @@ class OnForearm:
         return replace(state, T_rig_palm=state.T_rig_palm @ back, wrist_angles_rad=STRAIGHT)
 
 
-def wrist_motion(
-    name: str, model: HandModel, seed: int
-) -> Stations | GuidedCurl | GuidedSubject | RandomPoses | None:
-    """The motion of a scene's name; None: there is no such."""
-    if name == "curl":
-        return GuidedCurl(model)
-    if name == "subject":
-        return GuidedSubject(model, seed)
-    if name == "random":
-        return RandomPoses(model, seed)
-    if name == "standard":
-        return Stations(model, _STANDARD, seed)
-    if name == "spread":
-        return Stations(model, 3 * _SPREAD, seed)
-    if name == "poses":
-        rng = np.random.default_rng([seed, 12])
-        names = [name for _ in range(4) for name in rng.permutation(list(POSES)).tolist()]
-        return Stations(model, tuple(POSES[str(name)] for name in names), seed)
-    return None
+def _poses(model: HandModel, seed: int) -> Stations:
+    rng = np.random.default_rng([seed, 12])
+    names = [name for _ in range(4) for name in rng.permutation(list(POSES)).tolist()]
+    return Stations(model, [POSES[name] for name in names], seed)
 
 
-def _forearm(model: HandModel, t_s: float, shift_m: Float, rotation_rad: Float) -> Float:
+_MOTIONS: Mapping[str, Callable[[HandModel, int], HandMotion]] = {
+    "standard": lambda model, seed: Stations(model, _STANDARD, seed),
+    "curl": lambda model, _seed: GuidedCurl(model),
+    "subject": GuidedSubject,
+    "poses": _poses,
+    "spread": lambda model, seed: Stations(model, 3 * _SPREAD, seed),
+    "random": RandomPoses,
+}
+MOTIONS = tuple(_MOTIONS)
+
+
+def wrist_motion(name: str, model: HandModel, seed: int) -> HandMotion | None:
+    """The motion of a name of `MOTIONS`; None: there is no such."""
+    make = _MOTIONS.get(name)
+    return None if make is None else make(model, seed)
+
+
+def _forearm(model: HandModel, t_s: float, shift_m: Float = _NONE, rotation_rad: Float = _NONE) -> Float:
     """Palm pose in the room (4, 4): the forearm turns slowly while the fingers move."""
-    slow = FOREARM_ROTATION * np.sin(2.0 * np.pi * t_s / (PERIOD_S / 6) + np.array([0.0, 2.1, 4.2]))
-    return base_pose(
-        model, np.zeros(3), shift_m, slow - FOREARM_ROTATION * np.sin([0.0, 2.1, 4.2]) + rotation_rad
-    )
+    phase = np.array([0.0, 2.1, 4.2])
+    slow = FOREARM_ROTATION * np.sin(2.0 * np.pi * t_s / (PERIOD_S / 6) + phase)
+    return base_pose(model, _NONE, shift_m, slow - FOREARM_ROTATION * np.sin(phase) + rotation_rad)

@@ -20,6 +20,7 @@ from common.arrays import Bool, Float, Image
 from common.errors import CalibrationError
 from common.geometry.tapered_capsules import Capsules, Plane, first_hits, terms
 from common.recording.frame_recording import Illumination
+from common.sim.light import tile_place
 from common.sim.wrist.capsules import ALBEDO, THING_GROUP
 from common.sim.wrist.scene import WristScene
 from common.sim.wrist.surface import HandSurface, SurfaceView
@@ -104,29 +105,22 @@ def _box(image: Plane, low: Float, high: Float, level: float) -> None:
     cv2.rectangle(image, (x0, y0), (x1, y1), level, -1)
 
 
-class Leds:
-    """The LEDs beside the lens."""
+def led_levels(led_m: Float, points: Plane, normals: Plane, before: Capsules | None = None) -> Plane:
+    """Levels (N,) of skin at (N, 3) [m] by LEDs (L, 3) [m]: inverse square, cosine.
 
-    def __init__(self, led_m: Float) -> None:
-        """Of places (L, 3) [m], camera frame."""
-        self._led = led_m.astype(np.float32)
-
-    def on_surface(self, points: Plane, normals: Plane, before: Capsules | None = None) -> Plane:
-        """Levels (N,) of plain skin at (N, 3) [m]: inverse square, Lambert's cosine.
-
-        Only `before` throws shadows: those of one finger on another are narrow, so near to the lens are the
-        LEDs.
-        """
-        faced = normals @ self._led.T - np.einsum("ij,ij->i", normals, points)[:, None]
-        square = np.einsum("ij,ij->i", points, points)[:, None] - 2.0 * (points @ self._led.T)
-        square += (self._led * self._led).sum(axis=1)
-        np.maximum(faced, 0.0, out=faced)
-        if before is not None:
-            for led, place in enumerate(self._led):
-                faced[_in_shadow(before, place, points, square[:, led]), led] = 0.0
-        faced /= square * np.sqrt(square)
-        led_level = 88.0  # of skin that faces the LEDs at SURFACE_AT_M on the axis
-        return faced.sum(axis=1) * np.float32(led_level * SURFACE_AT_M**2 / len(self._led))
+    Only `before` throws shadows: those of one finger on another are narrow, so near to the lens are the LEDs.
+    """
+    leds = led_m.astype(np.float32)
+    faced = normals @ leds.T - np.einsum("ij,ij->i", normals, points)[:, None]
+    square = np.einsum("ij,ij->i", points, points)[:, None] - 2.0 * (points @ leds.T)
+    square += (leds * leds).sum(axis=1)
+    np.maximum(faced, 0.0, out=faced)
+    if before is not None:
+        for led, place in enumerate(leds):
+            faced[_in_shadow(before, place, points, square[:, led]), led] = 0.0
+    faced /= square * np.sqrt(square)
+    led_level = 88.0  # of skin that faces the LEDs at SURFACE_AT_M on the axis
+    return faced.sum(axis=1) * np.float32(led_level * SURFACE_AT_M**2 / len(leds))
 
 
 def _in_shadow(before: Capsules, origin: Plane, points: Plane, square: Plane) -> Bool:
@@ -146,7 +140,6 @@ class Sensor:
     """Adds noise, from a tile drawn once, and cuts at what a byte holds."""
 
     def __init__(self, height: int, width: int, seed: int) -> None:
-        """Of so many pixels."""
         rng = np.random.default_rng([seed, 32])
         self._tile = rng.standard_normal((height + _TILE_MARGIN, width + _TILE_MARGIN), dtype=np.float32)
         level = np.arange(256, dtype=np.float32)
@@ -156,9 +149,8 @@ class Sensor:
     def bytes_of(self, level: Plane, key: int) -> Image:
         """Image (H, W) of levels, black at BLACK_LEVEL; one key, one noise."""
         height, width = level.shape
-        mixed = (key * 2654435761 + 0x9E3779B9) & 0xFFFFFFFF  # Knuth's multiplicative hash
-        mixed = ((mixed ^ (mixed >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF
-        y, x = (mixed >> 4) % _TILE_MARGIN, (mixed >> 14) % _TILE_MARGIN
+        _, y, x = tile_place(key)
+        y, x = y % _TILE_MARGIN, x % _TILE_MARGIN
         noise = cv2.LUT(cv2.convertScaleAbs(level), self._sigma)
         cv2.multiply(noise, self._tile[y : y + height, x : x + width], dst=noise)
         return np.asarray(cv2.add(noise, level, dtype=cv2.CV_8U), dtype=np.uint8)  # rounded, and cut
@@ -191,9 +183,8 @@ def draw_stripe(level: Plane, scene: WristScene, bodies: Capsules, hand: Plane) 
     area = np.abs(piece[:, 0] * way[:, 1] - piece[:, 1] * way[:, 0]) * (heights[1] - heights[0])
     reach = np.linalg.norm(points - sheet.origin, axis=1)
     given_back = np.where(curve.group[chords] == THING_GROUP, ALBEDO, scene.reflectance)
-    amount = (LASER_LEVEL * given_back * facing * (SURFACE_AT_M / reach) * area)[:, None] * np.exp(
-        -0.5 * LAYERS**2
-    )
+    middle = LASER_LEVEL * given_back * facing * (SURFACE_AT_M / reach) * area
+    amount = middle[:, None] * np.exp(-0.5 * LAYERS**2)
     place = (uv + 0.5 * piece)[:, None] + heights[:, None] * way[:, None]
     _spread(level, place.reshape(-1, 2), amount.ravel(), hand)
 
@@ -206,10 +197,8 @@ def _spread(level: Plane, place: Float, amount: Float, hand: Plane) -> None:
     if not len(place):
         return
     edge_px = 40
-    (x0, y0), (x1, y1) = (
-        np.maximum(place.min(axis=0).astype(int) - edge_px, 0).tolist(),
-        np.minimum(place.max(axis=0).astype(int) + edge_px, [width, height]).tolist(),
-    )
+    x0, y0 = np.maximum(place.min(axis=0).astype(int) - edge_px, 0).tolist()
+    x1, y1 = np.minimum(place.max(axis=0).astype(int) + edge_px, [width, height]).tolist()
     w, h = x1 - x0, y1 - y0
     at = place - np.array([x0, y0])
     corner = at.astype(np.int64)
@@ -269,7 +258,7 @@ class WristRenderer:
         self._scene = scene
         self._surface = HandSurface(scene, step, wrist_step_rad)
         self._room = Room.of(scene.ambient, scene.seed)
-        self._leds = Leds(np.array(scene.rig.led, dtype=np.float64))
+        self._led_m = np.array(scene.rig.led, dtype=np.float64)
         optics = scene.optics
         self._sensor = Sensor(optics.height_px, optics.width_px, scene.seed)
         self._gain = 1.0
@@ -321,10 +310,8 @@ class WristRenderer:
         """Levels on the coarse grid: `behind` with skin in front, and things lit by LEDs."""
         shade = self._room.on_surface(surface.normals)
         if lit is Illumination.LED:
-            shade += (
-                self._leds.on_surface(surface.points, surface.normals, things)
-                * self._surface.flat[surface.pixel]
-            )
+            levels = led_levels(self._led_m, surface.points, surface.normals, things)
+            shade += levels * self._surface.flat[surface.pixel]
         level = behind.copy()
         level.reshape(-1)[surface.pixel] = shade * surface.albedo * np.float32(self._scene.reflectance)
         return level

@@ -8,7 +8,7 @@ it, and a little of angle is much of line: there the rays are cast more densely.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, cast, get_args
+from typing import Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
@@ -19,12 +19,12 @@ from common.geometry.camera_model import CameraModel
 from common.geometry.tapered_capsules import Capsules, distances
 from common.geometry.transforms import invert, rigid
 from common.hand.model import WRIST, HandJoints, HandModel
-from common.hand.wrist import forearm_palm
+from common.hand.wrist import STRAIGHT, forearm_palm
 from common.sim.motion import HandMotion, HandState
-from common.sim.scene import STANDARD_SEED, CameraTiming
+from common.sim.scene import STANDARD_SEED, CameraTiming, optics_of
 from common.sim.together import TOGETHER, together_motion
-from common.sim.wrist.capsules import GROUPS, THING_GROUP, HandCapsules, bodies_of, with_things
-from common.sim.wrist.motion import wrist_motion
+from common.sim.wrist.capsules import GROUPS, THING_GROUP, HandCapsules, bodies_of
+from common.sim.wrist.motion import MOTIONS, wrist_motion
 
 SEEN_WITHIN_M = 2e-4
 
@@ -150,13 +150,7 @@ class LaserSheet:
         which = np.flatnonzero(cut)
         if not which.size:
             return np.full(len(rays), np.inf), np.full(len(rays), first)
-        some = Capsules(
-            bodies.start_m[which],
-            bodies.stop_m[which],
-            bodies.start_radius_m[which],
-            bodies.stop_radius_m[which],
-        )
-        near, body = _nearest(distances(some, self.origin, rays))
+        near, body = _nearest(distances(bodies.of(which), self.origin, rays))
         return near, which[body]
 
     def seen(self, bodies: Capsules, points: Float, within_m: float = SEEN_WITHIN_M) -> Bool:
@@ -178,8 +172,7 @@ def _nearest(reach: Float) -> tuple[Float, Int]:
     return reach[np.arange(len(reach)), body], body
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LineTruth:
+class LineTruth(NamedTuple):
     """The line by group (7,), as in `WristTruth`."""
 
     uv: Float
@@ -222,7 +215,6 @@ class LineTruth:
 
 Ambient = Literal["dark", "indoor", "bright", "sun"]
 AMBIENTS: tuple[Ambient, ...] = get_args(Ambient)
-MOTIONS = ("standard", "curl", "subject", "poses", "spread", "random")
 WRIST_NAMES = f"{' | '.join((*MOTIONS, *TOGETHER))}, each with @{' | @'.join(AMBIENTS)}"
 
 
@@ -294,9 +286,7 @@ class WristScene:
         where = f"rig {self.rig.name!r}"
         if self.rig.kind != "wrist":
             raise CalibrationError(f"{where}: kind is {self.rig.kind!r}; a wrist scene needs 'wrist'")
-        name = self.rig.cameras[0]
-        if name not in self.cameras:
-            raise CalibrationError(f"{where}: cameras: no camera file for {name!r}")
+        optics = optics_of(self.rig, self.cameras)[self.rig.cameras[0]]
         for key in ("laser_plane", "laser", "T_camera_palm", "led"):
             if not getattr(self.rig, key):
                 raise CalibrationError(f"{where}: {key}: missing; a wrist device is simulated as it is built")
@@ -304,7 +294,6 @@ class WristScene:
             raise CalibrationError(
                 f"{where}: reflectance {self.reflectance}: expected a positive number, 1 is usual"
             )
-        optics = CameraModel.of(self.cameras[name], np.eye(4))
         object.__setattr__(self, "optics", optics)
         object.__setattr__(self, "T_camera_palm", np.array(self.rig.T_camera_palm, dtype=np.float64))
         object.__setattr__(self, "capsules", HandCapsules.of(self.model, self.seed))
@@ -345,23 +334,11 @@ class WristScene:
         self.rig.cameras.index(camera)
         return CameraTiming(0, 0.0)
 
-    def joints_at(self, t_s: float) -> HandJoints:
-        """The joints at scene time `t_s` [s], camera frame."""
-        return self._joints(self.motion.at(t_s))
-
-    def bodies_at(self, t_s: float) -> Capsules:
-        """Bodies that camera and laser meet at scene time `t_s` [s]: hand, things."""
-        return self.bodies_of(self.motion.at(t_s))
-
     def bodies_of(self, state: HandState) -> Capsules:
-        """The same of a hand in that state."""
+        """Bodies that camera and laser meet of a hand in that state: hand, things."""
         return self._bodies(state, self._joints(state))
 
-    def straight_bodies(self) -> Capsules:
-        """The flesh while wrist and fingers are straight, camera frame."""
-        return self.capsules.bodies(self._straight)
-
-    def flexed_bodies(self, wrist_angles_rad: Float) -> Capsules:
+    def straight_bodies(self, wrist_angles_rad: Float = STRAIGHT) -> Capsules:
         """Bodies of straight fingers with the wrist flexed by (2,) [rad], camera frame."""
         return self.bodies_of(HandState(np.eye(4), np.zeros((5, 4)), wrist_angles_rad))
 
@@ -377,12 +354,7 @@ class WristScene:
             t_s,
             state.angles_rad,
             joints,
-            line.uv,
-            line.plane_m,
-            line.centroid_m,
-            line.seen_m,
-            line.lit_m,
-            line.segment,
+            *line,
             tips,
             self.optics.project(tips),
             self.sheet.seen(bodies, tips, tip_within_m),
@@ -401,4 +373,4 @@ class WristScene:
         capsules = self.capsules.bodies(joints, R_straight)
         if not state.things:
             return capsules
-        return with_things(capsules, bodies_of(state.things, joints.T_rig_palm @ invert(state.T_rig_palm)))
+        return capsules.before(bodies_of(state.things, joints.T_rig_palm @ invert(state.T_rig_palm)))

@@ -81,7 +81,7 @@ class HandSurface:
             return self._palm(bodies, self._rotated)
         steps = tuple(np.rint(wrist_angles_rad / self._wrist_step_rad).astype(int).tolist())
         if self._flexed is None or self._flexed[0] != steps:
-            rounded = self._scene.flexed_bodies(self._wrist_step_rad * np.array(steps))
+            rounded = self._scene.straight_bodies(self._wrist_step_rad * np.array(steps))
             self._flexed = steps, self._palm(rounded, self._rotated)
         return self._flexed[1]
 
@@ -136,11 +136,8 @@ class HandSurface:
         sides = np.clip(
             np.stack([low.min(axis=1), 0.5 * (low + high).mean(axis=1), high.max(axis=1)]), -1.2, 1.2
         )
-        around = (
-            np.stack([sides[i, :, 0] for i in _AROUND[0]]),
-            np.stack([sides[i, :, 1] for i in _AROUND[1]]),
-        )
-        uv = self._scene.optics.distort(np.stack(around, axis=-1)) / self._step
+        around = np.stack([sides[list(at), :, axis] for axis, at in enumerate(_AROUND)], axis=-1)
+        uv = self._scene.optics.distort(around) / self._step
         margin = 1.5  # of the boxes, on the grid
         first, last = uv.min(axis=0) - margin, uv.max(axis=0) + margin + 1.0
         first[whole], last[whole] = 0.0, np.inf

@@ -171,7 +171,7 @@ def _equations(
     prior_px_m: float,
     cauchy_px: float | None,
 ) -> Normal:
-    """Normal equations [px] of the free unknowns at a bundle, with the prior of the shape [px/m]."""
+    """Normal equations [px] of the free unknowns, with the prior of the shape."""
     cameras, shape_at = len(bundle.lenses), 15 * len(bundle.lenses)
     place = np.cumsum(mask) - 1  # of a shared unknown among the free ones
     normal = Normal(int(mask.sum()), len(bundle.T_rig_board), 6)

@@ -164,8 +164,8 @@ class LiveViews:
         """The view that would help most now, for the camera that needs one most."""
         views = self.board_views()
         for name in sorted(self.cameras, key=lambda name: len(views.of(name))):
-            if wish := advice_so_far(views, name):
-                return f"for {name}, {wish}" if views.of(name) else wish
+            if advised := advice_so_far(views, name):
+                return f"for {name}, {advised}" if views.of(name) else advised
         alone = [
             name for name in self.cameras if not any({name} < set(view.observations) for view in self.views)
         ]

@@ -226,8 +226,8 @@ def _check_determined(camera: str, focal_sd: float, covered: Coverage, views: in
             " are needed: beyond them the distortion would be a guess"
         )
     if what:
-        wish = advice(covered)
-        raise FitError(f"camera {camera!r}: {what}, in {views} views{'; ' * bool(wish)}{wish}")
+        advised = advice(covered)
+        raise FitError(f"camera {camera!r}: {what}, in {views} views{'; ' * bool(advised)}{advised}")
 
 
 def _centre_sd(fit: CamerasFit, index: int) -> tuple[Float, float]:
@@ -315,8 +315,8 @@ def _lens_lines(name: str, lens: LensResult) -> Iterator[str]:
     )
     for row in covered.cells:
         yield "    " + "".join("#" if cell else "." for cell in row)
-    if wish := advice(covered):
-        yield f"  it would gain most if you {wish}"
+    if advised := advice(covered):
+        yield f"  it would gain most if you {advised}"
 
 
 def report_json(result: CamerasResult) -> dict[str, object]:

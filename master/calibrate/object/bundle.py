@@ -216,7 +216,7 @@ def _equations(seen: Seen, whiten: Float, loss: Loss, body: _Body) -> Normal:
     by_turn = -skew((R @ body.beads_m[..., None])[..., 0])
     by_pose = whiten @ np.concatenate([by_turn, np.broadcast_to(np.eye(3), by_turn.shape)], axis=-1)
     by_beads = np.zeros((epochs, count, 3, count, 3))
-    each = np.arange(count)
+    each = np.arange(count, dtype=np.int64)
     by_beads[:, each, :, each] = np.moveaxis(whiten @ R, 1, 0)
     normal = Normal(3 * count, epochs, 6)
     normal.add(

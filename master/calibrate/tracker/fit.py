@@ -239,7 +239,7 @@ class _Problem:
         return np.linalg.norm((self.whiten @ off[..., None])[..., 0], axis=1)
 
     def equations(self, placed: Placed, scale: float, share: Float | float = 1.0) -> Normal:
-        """Normal equations of the registration, all covariances `scale` squared times as large."""
+        """Normal equations of the registration, with all sigmas scaled."""
         rows, whiten, normal = self.rows(placed), self.whiten / scale, Normal(_UNKNOWNS)
         normal.add(
             (whiten @ -rows.off[..., None])[..., 0],

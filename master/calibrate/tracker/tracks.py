@@ -167,8 +167,8 @@ def coverage_of(seen: PoseTrack, tracker: PoseTrack, late_s: float = 0.0) -> Cov
     left, _, right = np.linalg.svd(total)
     mean = left @ np.diag([1.0, 1.0, float(np.linalg.det(left @ right))]) @ right
     rotation_vectors = matrix_to_rotation_vector(mean.T @ R)
-    pace = _pace(seen, seen.t_s[rows])
-    return Coverage(*times, _span(rotation_vectors), _span(p), *pace)
+    rates = _rms_rates(seen, seen.t_s[rows])
+    return Coverage(*times, _span(rotation_vectors), _span(p), *rates)
 
 
 def _known_s(t_s: Float) -> float:
@@ -183,15 +183,15 @@ def _span(values: Float) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _pace(track: PoseTrack, t_s: Float) -> tuple[float, float]:
-    pace_s = 0.2
-    first, begun, known = track.at(t_s - 0.5 * pace_s)
-    last, ended, also = track.at(t_s + 0.5 * pace_s)
+def _rms_rates(track: PoseTrack, t_s: Float) -> tuple[float, float]:
+    step_s = 0.2
+    first, begun, known = track.at(t_s - 0.5 * step_s)
+    last, ended, also = track.at(t_s + 0.5 * step_s)
     both = known & also
     if not both.any():
         return 0.0, 0.0
-    rotated = matrix_to_rotation_vector(first[both].swapaxes(1, 2) @ last[both]) / pace_s
-    moved = (ended[both] - begun[both]) / pace_s
+    rotated = matrix_to_rotation_vector(first[both].swapaxes(1, 2) @ last[both]) / step_s
+    moved = (ended[both] - begun[both]) / step_s
     return _rms(rotated), _rms(moved)
 
 

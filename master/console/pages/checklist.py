@@ -28,19 +28,16 @@ def build(state: ConsoleState) -> None:
 def _fill(checklist: Checklist | None, why: str) -> None:
     if checklist is None:
         _banner("help", "unknown", "Nobody checks", why)
-    elif not checklist.items:
-        _banner(
-            "check_circle",
-            "good",
-            "All is well",
-            "Cameras, colours, calibration, clocks and network are right.",
-        )
-    else:
-        count = len(checklist.items)
-        _banner("error", "bad", f"{count} {'thing needs' if count == 1 else 'things need'} you", "")
-        with ui.element("ul").classes("check-list"):
-            for item in checklist.items:
-                _item(item)
+        return
+    if not checklist.items:
+        text = "Cameras, colours, calibration, clocks and network are right."
+        _banner("check_circle", "good", "All is well", text)
+        return
+    count = len(checklist.items)
+    _banner("error", "bad", f"{count} {'thing needs' if count == 1 else 'things need'} you", "")
+    with ui.element("ul").classes("check-list"):
+        for item in checklist.items:
+            _item(item)
 
 
 def _banner(icon: str, kind: str, title: str, text: str) -> None:

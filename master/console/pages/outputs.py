@@ -4,21 +4,20 @@ The page changes the settings file; a process of its own follows it and sends. F
 block.
 """
 
-import asyncio
-import sys
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Literal, get_args, get_origin
 
 import msgspec
-from nicegui import background_tasks, ui
+from nicegui import ui
 
 from common.calibration import parse, save
-from common.calibration.output_settings import OutputPart, OutputSettings
+from common.calibration.output_settings import OutputSettings
 from common.errors import PhalanxError
 from common.messages import Health
-from master.console.controls import every
+from common.messages.streams import MASTER
+from master.console.controls import Problem, every, panel
 from master.console.recording_panel import play_panel, recording_panel
 from master.console.state import ConsoleState
 from master.outputs.network.outputs import OUTPUTS, switched_on
@@ -32,16 +31,7 @@ def outputs_path(state: ConsoleState) -> Path:
     return state.settings.calibration / "outputs" / "default.json"
 
 
-def read_outputs(state: ConsoleState) -> OutputSettings:
-    """The settings as they are now.
-
-    Raises:
-        CalibrationError: The file is broken.
-    """
-    return settings_of(outputs_path(state))
-
-
-def change_output(state: ConsoleState, name: str, change: dict[str, object]) -> OutputSettings:
+def change_output(state: ConsoleState, name: str, change: dict[str, object]) -> None:
     """Change one output in the settings file, whole or not at all, and `follow` it.
 
     Raises:
@@ -50,27 +40,26 @@ def change_output(state: ConsoleState, name: str, change: dict[str, object]) -> 
     """
     path = outputs_path(state)
     settings = settings_of(path)
-    part: OutputPart = OUTPUTS[name].part(settings)
-    new_part = msgspec.structs.replace(part, **change)
-    new = msgspec.structs.replace(settings, **{name: new_part})
+    part = msgspec.structs.replace(OUTPUTS[name].part(settings), **change)
+    new = msgspec.structs.replace(settings, **{name: part})
     new = parse(msgspec.json.encode(new), OutputSettings, f"{path}: {name}")
     path.parent.mkdir(parents=True, exist_ok=True)
     save(path, new)
-    follow(state, new)
-    return new
+    follow(state)
 
 
-def follow(state: ConsoleState, settings: OutputSettings) -> None:
+def follow(state: ConsoleState) -> None:
     """Run the output process exactly while some output is on, unless another's runs.
 
     Raises:
+        CalibrationError: The settings file is broken.
         PhalanxError: It cannot be started.
     """
-    wanted = any(switched_on(settings).values())
+    wanted = any(switched_on(settings_of(outputs_path(state))).values())
     ours = SENDING in state.local.running()
     if wanted and not ours and not _of_others(state):
-        tree = ["--calibration", str(state.settings.calibration), "--bus", state.settings.bus]
-        state.local.start(SENDING, [sys.executable, "-m", "master", "send", *tree], {})
+        tree = ("--calibration", str(state.settings.calibration), "--bus", state.settings.bus)
+        state.start(SENDING, "send", *tree)
     elif not wanted and ours:
         state.local.stop(SENDING)
 
@@ -95,44 +84,21 @@ _TITLES = {
 
 def output_panel(state: ConsoleState) -> None:
     """Build the panel."""
-    client = ui.context.client
-    with ui.element("section").classes("panel").props('aria-label="Live outputs"'):
-        ui.label("Live outputs").classes("panel-title")
+    with panel("Live outputs"):
         ui.label("A process of their own sends them; tracking never waits for it.").classes("soft")
-        error = ui.label("").classes("problem").props('role="alert"')
-        error.set_visibility(False)
+        problem = Problem()
         try:
-            settings = read_outputs(state)
-        except PhalanxError as problem:
-            ui.label(str(problem)).classes("problem").props('role="alert"')
+            settings = settings_of(outputs_path(state))
+        except PhalanxError as error:
+            problem.set_text(str(error))
             return
 
-        def change(name: str, values: dict[str, object]) -> None:
-            async def work() -> None:
-                try:
-                    await asyncio.to_thread(change_output, state, name, values)
-                    error.set_visibility(False)
-                except PhalanxError as problem:
-                    error.set_text(str(problem))
-                    error.set_visibility(True)
-                    with client:
-                        ui.notify(str(problem), type="negative", multi_line=True, close_button="OK")
-
-            background_tasks.create(work(), name=f"output {name}")
-
-        def begin() -> None:
-            async def work() -> None:
-                try:
-                    await asyncio.to_thread(lambda: follow(state, read_outputs(state)))
-                except PhalanxError as problem:
-                    error.set_text(str(problem))
-                    error.set_visibility(True)
-
-            background_tasks.create(work(), name="start sending")
+        async def change(name: str, values: dict[str, object]) -> None:
+            await problem.attempt(lambda: change_output(state, name, values))
 
         rows = {name: _row(name, settings, change) for name in OUTPUTS}
         start = ui.button("Start sending", icon="play_arrow").props("outline").classes("q-mt-sm")
-        start.on_click(begin)
+        start.on_click(lambda: problem.attempt(lambda: follow(state)))
         log = ui.label("").classes("mono").props('role="log" aria-label="Output of the sending process"')
 
     def update() -> None:
@@ -143,9 +109,7 @@ def output_panel(state: ConsoleState) -> None:
             label.set_text(words or (waiting_words(state, running, report) if switch.value else ""))
         idle = any(switch.value for switch, _ in rows.values()) and not running and NAME not in state.alive
         start.set_visibility(idle)
-        process = state.local.get(SENDING)
-        if process is not None:
-            log.set_text("\n".join(process.tail(4)))
+        log.set_text(state.local.tail(SENDING, 4))
 
     every(1.0, update)
 
@@ -165,13 +129,13 @@ def waiting_words(state: ConsoleState, running: bool, report: Health | None) -> 
         return "a moment …"  # the process looks at its file once a second
     if not running and NAME not in state.alive:
         return "nobody sends it"
-    return "starting …" if "master" in state.alive else "waiting for a master"
+    return "starting …" if MASTER in state.alive else "waiting for a master"
 
 
 def _row(
-    name: str, settings: OutputSettings, change: Callable[[str, dict[str, object]], None]
+    name: str, settings: OutputSettings, change: Callable[[str, dict[str, object]], Awaitable[None]]
 ) -> tuple[ui.switch, ui.label]:
-    title, what = _TITLES.get(name, (name, ""))
+    title, what = _TITLES[name]
     part = OUTPUTS[name].part(settings)
     with ui.element("div").classes("output"):
         switch = ui.switch(
@@ -182,39 +146,32 @@ def _row(
         ui.label(what).classes("soft output-what")
         with ui.row().classes("gap-2 output-fields"):
             for field in msgspec.structs.fields(part):
-                value: object = getattr(part, field.name)
+                key, value = field.name, getattr(part, field.name)
                 if get_origin(field.type) is Literal:
-                    _choice(name, field.name, [str(one) for one in get_args(field.type)], str(value), change)
-                elif field.name != "on" and isinstance(value, str | int):
-                    _field(name, field.name, value, change)
+                    box = ui.select([str(one) for one in get_args(field.type)], value=value, label=key)
+                    box.on_value_change(lambda event, key=key: change(name, {key: str(event.value)}))
+                elif key != "on" and isinstance(value, str | int):
+                    box = _field(key, value, lambda entered, key=key: change(name, {key: entered}))
+                else:
+                    continue
+                box.props(f'dense outlined aria-label="{name} {key}"').classes("output-field")
     return switch, status
 
 
-def _choice(
-    output: str, key: str, options: list[str], value: str, change: Callable[[str, dict[str, object]], None]
-) -> None:
-    box = ui.select(
-        options, value=value, label=key, on_change=lambda event: change(output, {key: str(event.value)})
-    )
-    box.props(f'dense outlined aria-label="{output} {key}"').classes("output-field")
+def _field(key: str, value: str | int, change: Callable[[str | int], Awaitable[None]]) -> ui.input:
+    box = ui.input(key.replace("_", " "), value=str(value))
+    last = str(value)
 
-
-def _field(output: str, key: str, value: str | int, change: Callable[[str, dict[str, object]], None]) -> None:
-    box = ui.input(key.replace("_", " "), value=str(value)).props(
-        f'dense outlined aria-label="{output} {key}"'
-    )
-    box.classes("output-field")
-    last = [str(value)]
-
-    def done() -> None:
+    async def done() -> None:
+        nonlocal last
         text = str(box.value or "").strip()
-        if text == last[0]:
-            return
-        last[0] = text
-        change(output, {key: int(text) if isinstance(value, int) and text.isdigit() else text})
+        if text != last:
+            last = text
+            await change(int(text) if isinstance(value, int) and text.isdigit() else text)
 
     box.on("blur", done)
     box.on("keydown.enter", done)
+    return box
 
 
 def build(state: ConsoleState) -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from nicegui import ui
 
-from master.console.controls import every
+from master.console.controls import every, panel
 from master.console.state import SPAN_S, ConsoleState, History
 
 _GREY = "#7d8590"  # readable on light and on dark
@@ -14,10 +14,10 @@ _COLOURS = ("#2f81f7", "#e3702f", "#2da44e", "#bf4b8a", "#9a6700", "#0e9aa7", "#
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """One plot: title with unit, and whole names of series, or starts with a dot."""
+    """One plot: title with unit, and how the names of its series begin."""
 
     title: str
-    series: tuple[str, ...]
+    starts: tuple[str, ...]
     from_zero: bool = True
 
 
@@ -40,7 +40,7 @@ def build(state: ConsoleState) -> None:
 
     def update() -> None:
         for plot, (chart, words) in zip(PLOTS, charts, strict=True):
-            names = names_of(plot, state.history)
+            names = [name for start in plot.starts for name in state.history.names(start)]
             chart.options["series"] = [
                 line(name, state.history, _COLOURS[k % len(_COLOURS)]) for k, name in enumerate(names)
             ]
@@ -48,16 +48,6 @@ def build(state: ConsoleState) -> None:
             words.set_text(latest_words(names, state.history))
 
     every(1.0, update)
-
-
-def names_of(plot: Plot, history: History) -> list[str]:
-    """The series of a plot that there are."""
-    return [
-        name
-        for start in plot.series
-        for name in history.names(start)
-        if name == start or (start.endswith(".") and name.startswith(start))
-    ]
 
 
 def line(name: str, history: History, colour: str) -> dict[str, object]:
@@ -86,34 +76,28 @@ def latest_words(names: Sequence[str], history: History) -> str:
 
 
 def _chart(plot: Plot) -> tuple[ui.echart, ui.label]:
-    with ui.element("section").classes("panel plot").props(f'aria-label="{plot.title}"'):
-        ui.label(plot.title).classes("panel-title")
+    grey = {"color": _GREY}
+    with panel(plot.title, "plot"):
         words = ui.label("").classes("soft plot-words")
         chart = ui.echart(
             {
                 "animation": False,
                 "textStyle": {"fontFamily": "inherit"},
                 "grid": {"left": 48, "right": 12, "top": 28, "bottom": 24},
-                "legend": {
-                    "show": True,
-                    "top": 0,
-                    "right": 0,
-                    "textStyle": {"color": _GREY},
-                    "type": "scroll",
-                },
+                "legend": {"show": True, "top": 0, "right": 0, "textStyle": grey, "type": "scroll"},
                 "xAxis": {
                     "type": "value",
                     "min": -SPAN_S,
                     "max": 0,
                     "axisLabel": {"color": _GREY, "formatter": "{value} s"},
                     "splitLine": {"show": False},
-                    "axisLine": {"lineStyle": {"color": _GREY}},
+                    "axisLine": {"lineStyle": grey},
                 },
                 "yAxis": {
                     "type": "value",
                     "scale": not plot.from_zero,
                     "min": 0 if plot.from_zero else None,
-                    "axisLabel": {"color": _GREY},
+                    "axisLabel": grey,
                     "splitLine": {"lineStyle": {"color": _GREY, "opacity": 0.25}},
                 },
                 "series": [],

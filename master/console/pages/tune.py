@@ -3,35 +3,219 @@
 Every change acts at once on the running slave or master, until it is saved or taken back.
 """
 
-import asyncio
 import colorsys
-from collections.abc import Callable, Mapping
-from typing import cast
+import math
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import NamedTuple, cast
 
-import msgspec
 from nicegui import background_tasks, ui
-from nicegui.client import Client
 
-from common.calibration import FilterCalibration
+from common.calibration import HsvRange
 from common.calibration.camera_settings import ROI_LEAST, ROI_MOST
-from common.errors import CalibrationError, PhalanxError
 from master.console.controls import (
     GAINS,
     CameraView,
     CommandQueue,
+    FilterTuner,
     InUse,
-    Range,
-    Setting,
+    Problem,
+    Tuner,
     colour_body,
-    full_frame_uv,
-    save_filter,
-    saved_filter,
-    try_filter,
-    update_copy,
+    no_camera,
 )
 from master.console.state import ConsoleState
 
 HUES = 180  # OpenCV's
+
+
+class Row(NamedTuple):
+    """One setting of a table.
+
+    Attributes:
+        key: Its name in `InUse.wanted`.
+        low, high: Ends of the slider, in the unit shown; a number beyond may be typed.
+        log: Whether the slider is logarithmic: the value spans decades.
+        factor: Of the unit shown, in that of the key.
+    """
+
+    key: str
+    title: str
+    unit: str
+    low: float
+    high: float
+    digits: int
+    log: bool = False
+    factor: float = 1.0
+    hint: str = ""
+
+
+# fmt: off
+_CAMERA = (
+    Row("exposure_us", "Exposure", "µs", 50.0, 30_000.0, 0, log=True),
+    Row("analogue_gain", "Gain", "", 1.0, 16.0, 2),
+    Row("red_gain", "White balance, red", "", 0.2, 4.0, 2),
+    Row("blue_gain", "White balance, blue", "", 0.2, 4.0, 2),
+    Row("frame_rate_hz", "Frame rate", "Hz", 5.0, 120.0, 0),
+    Row("roi_margin", "Search margin", "", ROI_LEAST, ROI_MOST, 2),
+)
+_FILTER = (
+    Row("min_cutoff_hz", "Cut-off at rest", "Hz", 0.5, 30.0, 1, log=True,
+        hint="lower: calmer at rest, later to start"),
+    Row("beta", "Rise with speed", "Hz per m/s", 0.0, 6000.0, 0, hint="higher: less lag in quick motion"),
+    Row("d_cutoff_hz", "Cut-off of the speed", "Hz", 0.5, 30.0, 1, log=True,
+        hint="how quickly the filter follows a change of speed"),
+    Row("jitter_m", "Jitter left at rest", "mm", 0.02, 3.0, 2, log=True, factor=1e-3,
+        hint="noisier signals are filtered more, down to this"),
+)
+# fmt: on
+
+
+class Setting:
+    """Slider and number field of one row.
+
+    A change by a person is passed once to `on_change`; `show` changes the controls and calls nothing.
+    """
+
+    def __init__(self, row: Row, on_change: Callable[[str, float], object]) -> None:
+        """Build the row; `on_change` gets its key and each new value, and may refuse."""
+        self._row, self._on_change = row, on_change
+        self._value: float | None = None  # in the unit shown
+        label = f"{row.title} ({row.unit})" if row.unit else row.title
+        with ui.element("div").classes("setting") as self._line:
+            ui.label(row.title).classes("setting-title")
+            low, high = (0.0, 1.0) if row.log else (row.low, row.high)
+            step = 0.001 if row.log else 10.0**-row.digits
+            self._slider = ui.slider(min=low, max=high, step=step, value=low)
+            self._slider.props(f'aria-label="{label}"').classes("setting-slider")
+            self._number = ui.number(value=None, format=f"%.{row.digits}f", suffix=row.unit or None)
+            self._number.props(f'dense outlined aria-label="{label}, number"').classes("setting-number")
+            self._back = ui.label("").classes("setting-back").props('role="status"')
+        if row.hint:
+            ui.label(row.hint).classes("soft setting-hint")
+        self._slider.on_value_change(lambda event: self._moved(event.value))
+        # Typed digit by digit: only what is finished is meant.
+        self._number.on("keydown.enter", lambda: self._typed())
+        self._number.on("blur", lambda: self._typed())
+
+    @property
+    def value(self) -> float | None:
+        """The value shown, in the unit of the key; None: none was shown yet."""
+        return None if self._value is None else self._value * self._row.factor
+
+    def show(self, now: InUse) -> None:
+        """Show what is wanted, and what was read back; nothing where it is not known."""
+        key, digits = self._row.key, self._row.digits
+        self._line.set_visibility(key in now.wanted)
+        if key not in now.wanted:
+            return
+        self._value = value = now.wanted[key] / self._row.factor
+        self._slider.set_value(self._place(value))
+        self._number.set_value(round(value, digits))
+        read = now.read.get(key, now.wanted[key]) / self._row.factor
+        same = math.isclose(read, value, rel_tol=0.01, abs_tol=0.6 * 10.0**-digits)
+        self._back.set_text("" if same else f"is {read:.{digits}f}")
+
+    def _moved(self, place: float | None) -> None:
+        row = self._row
+        if place is None or self._value is None or place == self._place(self._value):
+            return  # `show` moved it
+        self._change(round(row.low * (row.high / row.low) ** place if row.log else place, row.digits))
+
+    def _typed(self) -> None:
+        value, half = self._number.value, 0.5 * 10.0**-self._row.digits
+        if value is None or (self._value is not None and math.isclose(value, self._value, abs_tol=half)):
+            return
+        self._change(float(value))
+
+    def _change(self, value: float) -> None:
+        self._value = value
+        self._number.set_value(value)
+        self._slider.set_value(self._place(value))
+        self._on_change(self._row.key, value * self._row.factor)
+
+    def _place(self, value: float) -> float:
+        row = self._row
+        inside = min(max(value, row.low), row.high)
+        if not row.log:
+            return round(inside, row.digits)
+        return round(math.log(inside / row.low) / math.log(row.high / row.low), 3)
+
+
+class SettingsPanel:
+    """Settings of a table, each tried at once; saved, or taken back to what holds."""
+
+    def __init__(
+        self,
+        title: str,
+        about: str,
+        tuner: Tuner | FilterTuner,
+        rows: Iterable[Row],
+        where: str,
+        on_show: Callable[[InUse], object] = lambda _: None,
+    ) -> None:
+        """Build it in the present slot.
+
+        `where` is what `tuner` saves to, for a person; `on_show` gets all that is shown.
+        """
+        self._client, self._tuner, self._on_show = ui.context.client, tuner, on_show
+        self._queue = CommandQueue(tuner.set, self._show, self.fail)
+        with ui.row().classes("panel-head"):
+            ui.label(title).classes("panel-title")
+            self._spin = ui.spinner(size="sm").props('aria-label="waiting for the answer"')
+        if about:
+            ui.label(about).classes("soft")
+        self._settings = {row.key: Setting(row, self._changed) for row in rows}
+        self._problem = Problem()
+        with ui.row().classes("panel-foot"):
+            save = ui.button("Save", icon="save").props("unelevated")
+            save.on_click(lambda: self.do(tuner.save, f"saved to {where}", "saved"))
+            ui.button("Revert", icon="undo", on_click=lambda: self.do(tuner.revert)).props("outline")
+            self._saved = ui.label("").classes("soft")
+        background_tasks.create(self.do(tuner.refresh), name=f"tune {where}")
+
+    def change(self, key: str, value: object) -> None:
+        """Try `key: value`, as `CommandQueue.change`."""
+        self._queue.change(key, value)
+        self._saved.set_text("not saved")
+
+    async def do(self, step: Callable[[], InUse], done: str = "", saved: str = "") -> None:
+        """Run a step of the tuner and show its answer, with `done` as a message."""
+        self._spin.set_visibility(True)
+        try:
+            answered = await self._problem.attempt(step, self._show)
+        finally:
+            self._spin.set_visibility(False)
+        if not answered:
+            self._show_held()
+            return
+        self._saved.set_text(saved)
+        if done:
+            with self._client:
+                ui.notify(done, type="positive")
+
+    def fail(self, text: str) -> None:
+        """Show an error, and what holds."""
+        self._show_held()
+        self._problem.show(text)
+
+    def _changed(self, key: str, value: float) -> None:
+        if key in GAINS:
+            self.change("colour_gains", [self._settings[gain].value or 1.0 for gain in GAINS])
+        else:
+            self.change(key, value)
+
+    def _show(self, now: InUse) -> None:
+        self._problem.set_text("")
+        for setting in self._settings.values():
+            setting.show(now)
+        self._on_show(now)
+
+    def _show_held(self) -> None:
+        if self._tuner.now.wanted:  # it has answered before
+            for setting in self._settings.values():
+                setting.show(self._tuner.now)
+            self._on_show(self._tuner.now)
 
 
 class ColourPanel:
@@ -40,7 +224,7 @@ class ColourPanel:
     def __init__(
         self,
         markers: tuple[str, ...],
-        on_change: Callable[[str, Range], object],
+        on_change: Callable[[str, HsvRange], object],
         on_forget: Callable[[str], object],
         tint: Callable[[tuple[str, ...]], object],
     ) -> None:
@@ -50,12 +234,11 @@ class ColourPanel:
         `tint` the markers whose pixels are to be tinted in the picture.
         """
         self._markers, self._on_change, self._tint = markers, on_change, tint
-        self._colours: dict[str, Range] = {}
+        self._colours: dict[str, HsvRange] = {}
         self._showing = False
-        self._chosen = markers[0] if markers else None
-        options = {name: name for name in markers}
         with ui.row().classes("marker-choice items-center"):
-            self._which = ui.toggle(options, value=self._chosen, on_change=lambda: self._choose())
+            first = markers[0] if markers else None
+            self._which = ui.toggle(list(markers), value=first, on_change=self._choose)
             self._which.props('no-caps dense unelevated toggle-color=primary aria-label="Marker"')
         with ui.row().classes("items-center gap-2"):
             self._swatch = ui.element("span").classes("swatch").props('role="img"')
@@ -64,345 +247,147 @@ class ColourPanel:
             self._tints = ui.select(
                 {"none": "nothing tinted", "one": "this marker tinted", "all": "all markers tinted"},
                 value="one",
-                on_change=lambda: self._retint(),
+                on_change=self._retint,
             ).props('dense outlined aria-label="What is tinted in the picture"')
-        self._rows = ui.column().classes("w-full gap-0")
-        with self._rows:
-            self._hue = _range("Hue", 0, HUES - 1, self._changed)
+        with ui.column().classes("w-full gap-0") as self._rows:
+            hue = self._range("Hue", HUES - 1).classes("hue")
             with ui.row().classes("wrap-row"):
-                self._wraps = ui.switch(
-                    "through red (the hue wraps around)", on_change=lambda: self._changed()
-                )
-            self._saturation = _range("Saturation", 0, 255, self._changed)
-            self._value = _range("Value", 0, 255, self._changed)
+                self._wraps = ui.switch("through red (the hue wraps around)", on_change=self._changed)
+            self._channels = (hue, self._range("Saturation", 255), self._range("Value", 255))
             forget = ui.button("Forget this colour", icon="delete").props("flat dense")
-            forget.on_click(lambda: None if self._chosen is None else on_forget(self._chosen))
+            forget.on_click(lambda: None if self.marker is None else on_forget(self.marker))
         self._choose()
 
     @property
     def marker(self) -> str | None:
         """The marker that is being tuned."""
-        return self._chosen
+        return cast(str | None, self._which.value)
 
-    def show(self, colours: Mapping[str, Range]) -> None:
+    def show(self, colours: Mapping[str, HsvRange]) -> None:
         """Show what is in use."""
         self._colours = dict(colours)
         self._display()
 
+    def _range(self, title: str, high: int) -> ui.range:
+        with ui.element("div").classes("setting range"):
+            ui.label(title).classes("setting-title")
+            made = ui.range(min=0, max=high, step=1, on_change=self._changed)
+            return made.props(f'label aria-label="{title}, lowest and highest"').classes("setting-slider")
+
     def _choose(self) -> None:
-        self._chosen = cast(str | None, self._which.value)
         self._display()
         self._retint()
 
     def _retint(self) -> None:
-        chosen = (self._chosen,) if self._chosen is not None else ()
+        chosen = (self.marker,) if self.marker is not None else ()
         self._tint({"none": (), "one": chosen, "all": self._markers}[str(self._tints.value)])
 
     def _display(self) -> None:
-        colour = None if self._chosen is None else self._colours.get(self._chosen)
+        colour = None if self.marker is None else self._colours.get(self.marker)
         self._rows.set_visibility(colour is not None)
         if colour is None:
             self._words.set_text("no colour yet: click on the marker in the picture")
             self._swatch.style("background: transparent")
             return
         self._showing = True
-        low, high = colour.low, colour.high
-        wraps = low[0] > high[0]
-        self._wraps.set_value(wraps)
-        self._hue.set_value({"min": min(low[0], high[0]), "max": max(low[0], high[0])})
-        self._saturation.set_value({"min": low[1], "max": high[1]})
-        self._value.set_value({"min": low[2], "max": high[2]})
+        self._wraps.set_value(colour.hsv_low[0] > colour.hsv_high[0])
+        for channel, low, high in zip(self._channels, colour.hsv_low, colour.hsv_high, strict=True):
+            channel.set_value({"min": min(low, high), "max": max(low, high)})
         self._showing = False
         self._describe(colour)
 
-    def _describe(self, colour: Range) -> None:
+    def _describe(self, colour: HsvRange) -> None:
         middle = _middle(colour)
         self._swatch.style(f"background: {middle}")
-        self._swatch.props(f'aria-label="{self._chosen}: about {middle}"')
-        low, high = colour.low, colour.high
-        self._words.set_text(f"H {low[0]}–{high[0]}, S {low[1]}–{high[1]}, V {low[2]}–{high[2]}")
+        self._swatch.props(f'aria-label="{self.marker}: about {middle}"')
+        ends = zip("HSV", colour.hsv_low, colour.hsv_high, strict=True)
+        self._words.set_text(", ".join(f"{channel} {low}–{high}" for channel, low, high in ends))
 
     def _changed(self) -> None:
-        if self._showing or self._chosen is None:
+        if self._showing or self.marker is None:
             return
-        hue, saturation, value = (_ends(one) for one in (self._hue, self._saturation, self._value))
+        ends = [cast(dict[str, float], channel.value) for channel in self._channels]
+        hue, saturation, value = ((round(one["min"]), round(one["max"])) for one in ends)
         if self._wraps.value:
             hue = hue[::-1]
-        colour = Range((hue[0], saturation[0], value[0]), (hue[1], saturation[1], value[1]))
-        if colour == self._colours.get(self._chosen):
+        low, high = zip(hue, saturation, value, strict=True)
+        colour = HsvRange(hsv_low=low, hsv_high=high)
+        if colour == self._colours.get(self.marker):
             return
-        self._colours[self._chosen] = colour
+        self._colours[self.marker] = colour
         self._describe(colour)
-        self._on_change(self._chosen, colour)
+        self._on_change(self.marker, colour)
 
 
-def _range(title: str, low: int, high: int, changed: Callable[[], None]) -> ui.range:
-    with ui.element("div").classes("setting range"):
-        ui.label(title).classes("setting-title")
-        made = ui.range(min=low, max=high, step=1, on_change=lambda: changed())
-        made.props(f'label aria-label="{title}, lowest and highest"').classes("setting-slider")
-        if title == "Hue":
-            made.classes("hue")
-    return made
-
-
-def _ends(control: ui.range) -> tuple[int, int]:
-    value = control.value or {"min": 0.0, "max": 0.0}
-    return round(value["min"]), round(value["max"])
-
-
-def _middle(colour: Range) -> str:
-    low, high = colour.low, colour.high
-    span = (high[0] - low[0]) % HUES
-    hue = (low[0] + span / 2.0) % HUES
+def _middle(colour: HsvRange) -> str:
+    low, high = colour.hsv_low, colour.hsv_high
+    hue = (low[0] + ((high[0] - low[0]) % HUES) / 2.0) % HUES
     r, g, b = colorsys.hsv_to_rgb(hue / HUES, (low[1] + high[1]) / 510.0, (low[2] + high[2]) / 510.0)
     return f"rgb({255 * r:.0f}, {255 * g:.0f}, {255 * b:.0f})"
 
 
-# Name of the metric, title, unit, slider from, to, decimals, logarithmic.
-_SETTINGS: tuple[tuple[str, str, str, float, float, int, bool], ...] = (
-    ("exposure_us", "Exposure", "µs", 50.0, 30_000.0, 0, True),
-    ("analogue_gain", "Gain", "", 1.0, 16.0, 2, False),
-    ("red_gain", "White balance, red", "", 0.2, 4.0, 2, False),
-    ("blue_gain", "White balance, blue", "", 0.2, 4.0, 2, False),
-    ("frame_rate_hz", "Frame rate", "Hz", 5.0, 120.0, 0, False),
-    ("roi_margin", "Search margin", "", ROI_LEAST, ROI_MOST, 2, False),
-)
+def camera_panel(state: ConsoleState, camera: str) -> None:
+    """Build the controls of one camera and its rigs' markers."""
+    tuner = state.tuner(camera)
 
+    async def picked(x: float, y: float, t_ns: int) -> None:
+        marker = colours.marker
+        if marker is not None:
+            await settings.do(
+                lambda: state.pick(camera, marker, x, y, t_ns), f"took the colour of {marker}", "not saved"
+            )
 
-class CameraPanel:
-    """Controls of one page for one camera, with the last answer of the slave."""
+    def change(marker: str, colour: HsvRange) -> object:
+        return settings.change("markers", {marker: colour_body(colour)})
 
-    def __init__(self, state: ConsoleState, camera: str, markers: tuple[str, ...]) -> None:
-        """Build them in the present slot; `markers` are those of its rigs."""
-        self._state, self._camera, self._markers = state, camera, markers
-        self._tuner = state.tuner(camera)
-        self._client: Client = ui.context.client
-        self._now: InUse | None = None
-        self._command_queue = CommandQueue(self._tuner.set, self._show, self._fail)
-        self._settings: dict[str, Setting] = {}
-        with ui.element("div").classes("tune-grid"):
-            with (
-                ui.element("section").classes("panel tune-picture").props(f'aria-label="Picture of {camera}"')
-            ):
-                self._picture()
-            with (
-                ui.element("section")
-                .classes("panel tune-controls")
-                .props(f'aria-label="Settings of {camera}"')
-            ):
-                self._controls()
-        self._do(self._tuner.refresh)
+    async def forget(marker: str) -> None:
+        await settings.do(lambda: tuner.forget(marker), f"forgot the colour of {marker}", "not saved")
 
-    def _picture(self) -> None:
-        view = CameraView(
-            self._camera,
-            f"Picture of camera {self._camera}. Arrow keys move the cross, Enter picks the colour there",
-            self._picked,
-        )
-        ui.label("Click on a marker in the picture to take its colour.").classes("soft")
-        self._colours = ColourPanel(self._markers, self._coloured, self._forget, view.tint)
-
-    def _controls(self) -> None:
-        with ui.row().classes("panel-head"):
-            ui.label("Settings").classes("panel-title")
-            self._spin = ui.spinner(size="sm").props('aria-label="waiting for the camera"')
-        for name, title, unit, low, high, digits, log in _SETTINGS:
-            change = self._changer(name)
-            self._settings[name] = Setting(title, unit, low, high, change, digits=digits, log=log)
-        self._error = ui.label("").classes("problem").props('role="alert"')
-        self._error.set_visibility(False)
-        with ui.row().classes("panel-foot"):
-            ui.button("Save", icon="save", on_click=self._save).props("unelevated")
-            ui.button("Revert", icon="undo", on_click=lambda: self._do(self._tuner.revert)).props("outline")
-            self._state_of_file = ui.label("").classes("soft")
-
-    def _changer(self, name: str) -> Callable[[float], None]:
-        def change(value: float) -> None:
-            if name in GAINS:
-                pair = [self._settings[gain].value or 1.0 for gain in GAINS]
-                self._command_queue.change("colour_gains", pair)
-            else:
-                self._command_queue.change(name, value)
-            self._state_of_file.set_text("not saved")
-
-        return change
-
-    def _coloured(self, marker: str, colour: Range) -> None:
-        self._command_queue.change("markers", colour_body(colour), part=marker)
-        self._state_of_file.set_text("not saved")
-
-    def _forget(self, marker: str) -> None:
-        self._do(lambda: self._tuner.forget(marker), f"forgot the colour of {marker}", "not saved")
-
-    def _picked(self, x: float, y: float, t_ns: int) -> None:
-        marker = self._colours.marker
-        if marker is None:
-            return
-        try:
-            camera = self._state.camera(self._camera)
-        except CalibrationError as error:
-            self._fail(str(error))
-            return
-        uv = full_frame_uv(x, y, camera.width_px, camera.height_px)
-        self._do(lambda: self._tuner.pick(marker, uv, t_ns), f"took the colour of {marker}", "not saved")
-
-    def _save(self) -> None:
-        self._do(self._save_both, f"saved to the camera file of {self._camera}", "saved")
-
-    def _save_both(self) -> InUse:
-        """Save the slave's file, then this machine's copy where the slave is elsewhere."""
-        saved = self._tuner.save()
-        path = self._state.camera_path(self._camera)
-        if path.exists():
-            update_copy(path, saved)
-        return saved
-
-    def _do(self, step: Callable[[], InUse], done: str = "", state: str = "") -> None:
-        async def work() -> None:
-            self._spin.set_visibility(True)
-            try:
-                answer = await asyncio.to_thread(step)
-            except PhalanxError as error:
-                self._fail(str(error))
-                return
-            finally:
-                self._spin.set_visibility(False)
-            self._show(answer)
-            self._state_of_file.set_text(state)
-            if done:
-                with self._client:
-                    ui.notify(done, type="positive")
-
-        background_tasks.create(work(), name=f"tune {self._camera}")
-
-    def _show(self, now: InUse) -> None:
-        self._now = now
-        self._error.set_visibility(False)
-        self._spin.set_visibility(False)
-        for name, setting in self._settings.items():
-            if name in now.wanted:
-                setting.show(now.wanted[name], now.read.get(name))
-            setting.set_visible(name in now.wanted)
-        self._colours.show(now.markers)
-
-    def _fail(self, text: str) -> None:
-        with self._client:
-            ui.notify(text, type="negative", multi_line=True, close_button="OK")
-        if self._now is not None:
-            self._show(self._now)  # which hides the error
-        self._error.set_text(text)
-        self._error.set_visibility(True)
-
-
-# Name of the key, title, unit, factor to the key's unit, slider from, to, decimals, logarithmic, what it does.
-# fmt: off
-_PARAMETERS: tuple[tuple[str, str, str, float, float, float, int, bool, str], ...] = (
-    ("min_cutoff_hz", "Cut-off at rest", "Hz", 1.0, 0.5, 30.0, 1, True, "lower: calmer at rest, later to start"),
-    ("beta", "Rise with speed", "Hz per m/s", 1.0, 0.0, 6000.0, 0, False, "higher: less lag in quick motion"),
-    ("d_cutoff_hz", "Cut-off of the speed", "Hz", 1.0, 0.5, 30.0, 1, True,
-     "how quickly the filter follows a change of speed"),
-    ("jitter_m", "Jitter left at rest", "mm", 1e-3, 0.02, 3.0, 2, True,
-     "noisier signals are filtered more, down to this"),
-)
-# fmt: on
+    with ui.element("div").classes("tune-grid"):
+        with ui.element("section").classes("panel tune-picture").props(f'aria-label="Picture of {camera}"'):
+            keys = "Arrow keys move the cross, Enter picks the colour there"
+            view = CameraView(camera, f"Picture of camera {camera}. {keys}", picked)
+            ui.label("Click on a marker in the picture to take its colour.").classes("soft")
+            colours = ColourPanel(
+                state.markers_of(camera),
+                change,
+                forget,
+                view.tint,
+            )
+        with ui.element("section").classes("panel tune-controls").props(f'aria-label="Settings of {camera}"'):
+            where = f"the camera file of {camera}"
+            settings = SettingsPanel(
+                "Settings", "", tuner, _CAMERA, where, lambda now: colours.show(now.markers)
+            )
 
 
 def filter_panel(state: ConsoleState, rig: str) -> None:
     """Build the controls of the filter of `rig`."""
-    client = ui.context.client
-    settings: dict[str, Setting] = {}
-    path = state.rig_path(rig)
-
-    def values() -> dict[str, float]:
-        return {name: (settings[name].value or 0.0) * factor for name, _, _, factor, *_ in _PARAMETERS}
-
-    def tried(_: object) -> None:
-        error.set_visibility(False)
-        status.set_text("in use, not saved")
-
-    def fail(text: str) -> None:
-        error.set_text(text)
-        error.set_visibility(True)
-        with client:
-            ui.notify(text, type="negative", multi_line=True, close_button="OK")
-
-    def apply(change: Mapping[str, object]) -> None:
-        try_filter(state.link.ask, rig, values())
-
-    command_queue: CommandQueue[None] = CommandQueue(apply, tried, fail)
-
-    def show(now: FilterCalibration) -> None:
-        for name, _, _, factor, *_ in _PARAMETERS:
-            settings[name].show(float(msgspec.structs.asdict(now)[name]) / factor)
-
-    def do(step: Callable[[], None], text: str) -> None:
-        async def work() -> None:
-            try:
-                await asyncio.to_thread(step)
-                now = await asyncio.to_thread(saved_filter, path)
-            except PhalanxError as problem:
-                fail(str(problem))
-                return
-            show(now)
-            error.set_visibility(False)
-            status.set_text(text)
-
-        background_tasks.create(work(), name=f"filter {rig}")
-
     with ui.element("section").classes("panel filter-panel").props(f'aria-label="Filter of {rig}"'):
-        ui.label(f"The 1 € filter of {rig}").classes("panel-title")
-        ui.label(
-            "Every change acts on the running master at once; save writes it to the rig's file."
-        ).classes("soft")
-        for name, title, unit, _, low, high, digits, log, does in _PARAMETERS:
-            settings[name] = Setting(
-                title,
-                unit,
-                low,
-                high,
-                lambda _value: command_queue.change("filter", True),
-                digits=digits,
-                log=log,
-            )
-            ui.label(does).classes("soft setting-hint")
-        error = ui.label("").classes("problem").props('role="alert"')
-        error.set_visibility(False)
-        with ui.row().classes("panel-foot"):
-            ui.button(
-                "Save", icon="save", on_click=lambda: do(lambda: save_filter(path, values()), "saved")
-            ).props("unelevated")
-
-            def back() -> None:
-                now = saved_filter(path)
-                try_filter(state.link.ask, rig, msgspec.structs.asdict(now))
-
-            ui.button("Revert", icon="undo", on_click=lambda: do(back, "as saved")).props("outline")
-            status = ui.label("").classes("soft")
-    do(lambda: None, "")
+        about = "Every change acts on the running master at once; save writes it to the rig's file."
+        tuner = FilterTuner(rig, state.rig_path(rig), state.link.ask)
+        SettingsPanel(f"The 1 € filter of {rig}", about, tuner, _FILTER, f"the file of rig {rig}")
 
 
 def build(state: ConsoleState) -> None:
     """Fill the page."""
-    cameras = state.cameras()
-    rigs = state.rigs()
-    if not cameras:
-        with ui.element("div").classes("panel empty"):
-            ui.label("No camera to tune yet")
-            ui.label("The Set-up page starts one.").classes("soft")
+    tabs: dict[str, tuple[str, Callable[[], None]]] = {}
+    for camera in state.cameras():
+        tabs[camera] = "videocam", partial(camera_panel, state, camera)
+    if not tabs:
+        no_camera("No camera to tune yet")
         return
-    filtered = [name for name, rig in rigs.items() if rig.kind == "markers"]
-    names = [*cameras, *(f"filter of {rig}" for rig in filtered)]
+    for name, rig in state.rigs().items():
+        if rig.kind == "markers":
+            tabs[f"filter of {name}"] = "filter_alt", partial(filter_panel, state, name)
+    with ui.tabs().classes("tune-tabs").props("dense no-caps align=left outside-arrows mobile-arrows") as bar:
+        for name, (icon, _) in tabs.items():
+            ui.tab(name, icon=icon).props("inline-label")
     with (
-        ui.tabs().classes("tune-tabs").props("dense no-caps align=left outside-arrows mobile-arrows") as tabs
+        ui.tab_panels(bar, value=next(iter(tabs)), animated=False)
+        .classes("tune-panels")
+        .props("keep-alive=false")
     ):
-        for name in names:
-            ui.tab(name, icon="videocam" if name in cameras else "filter_alt").props("inline-label")
-    with ui.tab_panels(tabs, value=names[0], animated=False).classes("tune-panels").props("keep-alive=false"):
-        for camera in cameras:
-            markers = tuple(name for rig in rigs.values() if camera in rig.cameras for name in rig.markers)
-            with ui.tab_panel(camera):
-                CameraPanel(state, camera, markers)
-        for rig in filtered:
-            with ui.tab_panel(f"filter of {rig}"):
-                filter_panel(state, rig)
+        for name, (_, fill) in tabs.items():
+            with ui.tab_panel(name):
+                fill()

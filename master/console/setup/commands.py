@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 from common.bus.keys import ENVIRONMENT, RIG_KEY, keys_folder, rig_key
-from common.calibration import RigCalibration, load
 from common.command_line import Command, Number
 from common.errors import CalibrationError
 from master.cli.table import CALIBRATIONS
@@ -24,9 +23,10 @@ from master.commands.keys import AUTHORITY_KEY, files_of_device, make
 from master.console.setup.files import KEY_FILE, CameraPlan, Plan, key_of
 from master.console.state import ConsoleSettings
 
-Shape = Literal["text", "number", "whole", "flag", "choice", "path", "list"]
+Shape = Literal["text", "number", "whole", "flag", "choice", "list"]
 Value = str | float | bool | None
 _UNITS = {"_m_s": "m/s", "_mm": "mm", "_px": "px", "_ms": "ms", "_deg": "°"}
+_MODULE = [sys.executable, "-m"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,6 @@ class Field:
 
     name: str
     flag: str
-    label: str
     help: str
     shape: Shape
     default: Value
@@ -51,6 +50,14 @@ class Field:
     choices: tuple[str, ...] = ()
     low: float | None = None
     high: float | None = None
+
+    @property
+    def label(self) -> str:
+        """Its name for a person: `square_mm` is "Square (mm)"."""
+        for end, unit in _UNITS.items():
+            if self.name.endswith(end):
+                return f"{self.name.removesuffix(end).replace('_', ' ').capitalize()} ({unit})"
+        return self.name.replace("_", " ").capitalize()
 
 
 def fields_of(command: Command) -> tuple[Field, ...]:
@@ -91,19 +98,17 @@ def _text(field: Field, value: Value) -> str | None:
     """The value as it stands on a command line; None: it is left out."""
     if value is None or value == "":
         return None
-    if field.shape in ("number", "whole"):
-        try:
-            number = float(value)
-        except ValueError as error:
-            raise CalibrationError(f"{field.label}: {value!r} is no number") from error
-        if (field.low is not None and number < field.low) or (field.high is not None and number > field.high):
-            raise CalibrationError(
-                f"{field.label}: {number:g} is not in {field.low:g} to {field.high or 1e9:g}"
-            )
-        if field.shape == "whole" and number != round(number):
-            raise CalibrationError(f"{field.label}: {number:g} is no whole number")
-        return f"{round(number)}" if field.shape == "whole" else f"{number:.12g}"
-    return str(value).strip() or None
+    if field.shape not in ("number", "whole"):
+        return str(value).strip() or None
+    try:
+        number = float(value)
+    except ValueError as error:
+        raise CalibrationError(f"{field.label}: {value!r} is no number") from error
+    if (field.low is not None and number < field.low) or (field.high is not None and number > field.high):
+        raise CalibrationError(f"{field.label}: {number:g} is not in {field.low:g} to {field.high or 1e9:g}")
+    if field.shape == "whole" and number != round(number):
+        raise CalibrationError(f"{field.label}: {number:g} is no whole number")
+    return f"{round(number)}" if field.shape == "whole" else f"{number:.12g}"
 
 
 class _Declared(ArgumentParser):
@@ -120,46 +125,22 @@ class _Declared(ArgumentParser):
 
 def _field(action: Action) -> Field:
     flag = next((one for one in action.option_strings if one.startswith("--")), "")
-    number = action.type if isinstance(action.type, Number) else None
     default = cast(object, action.default)
-    return Field(
-        action.dest,
-        flag,
-        label_of(action.dest),
-        (action.help or "") % {"default": default},
-        _shape(action),
-        None if action.required or default is None or default == [] else _value(default),
-        action.required,
-        tuple(str(one) for one in action.choices or ()),
-        None if number is None else number.low,
-        None if number is None else number.high,
-    )
-
-
-def label_of(name: str) -> str:
-    """An option's name for a person: `square_mm` is "Square (mm)"."""
-    for end, unit in _UNITS.items():
-        if name.endswith(end):
-            return f"{name.removesuffix(end).replace('_', ' ').capitalize()} ({unit})"
-    return name.replace("_", " ").capitalize()
-
-
-def _value(default: object) -> Value:
-    if isinstance(default, (bool, int, float, str)):
-        return default
-    return str(default)
-
-
-def _shape(action: Action) -> Shape:
+    shown = default if default is None or isinstance(default, (bool, int, float, str)) else str(default)
+    text = (action.help or "") % {"default": default}
+    shape: Shape = "text"
+    low = high = None
     if action.nargs == 0:
-        return "flag"
-    if action.choices is not None:
-        return "choice"
-    if isinstance(action.default, list):
-        return "list"
-    if isinstance(action.type, Number):
-        return "whole" if action.type.whole else "number"
-    return "path" if action.type is Path else "text"
+        shape = "flag"
+    elif action.choices is not None:
+        shape = "choice"
+    elif isinstance(default, list):
+        shape, shown = "list", None
+    elif isinstance(action.type, Number):
+        shape, low, high = ("whole" if action.type.whole else "number"), action.type.low, action.type.high
+    choices = tuple(str(one) for one in action.choices or ())
+    shown = None if action.required else shown
+    return Field(action.dest, flag, text, shape, shown, action.required, choices, low, high)
 
 
 # What simulated cameras can look at: scene -> text. "still" is the hand before its motion begins.
@@ -172,7 +153,9 @@ VIEWS = {
     "hand-routine": "the routine that measures a hand",
     "object": "a hand and an object",
 }
-_CLOCK = "--scene-epoch-ns"
+
+# Where a command writes a page to print, or pictures; all others write a tree of files.
+_OUT = {"board": "board.pdf", "cube": "box.pdf", "capture": "views"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,21 +192,13 @@ class Commands:
         Simulated ones look at `view`, a key of `VIEWS` or any scene, which begins at `epoch_ns`,
         `epoch_of(view)` for all.
         """
-        line = [
-            sys.executable,
-            "-m",
-            "slave",
-            "run",
-            *self._place(camera),
-            *self._driver(camera, view, epoch_ns),
-        ]
-        here = self.settings.beacon.startswith("127.")
-        return [*line, "--beacon-port", self._port, "--bind", "127.0.0.1" if here else "0.0.0.0"]
+        bind = "127.0.0.1" if self.settings.beacon.startswith("127.") else "0.0.0.0"
+        return [*self._slave("run", camera, view, epoch_ns), "--beacon-port", self._port, "--bind", bind]
 
     def record(self, camera: CameraPlan, view: str, epoch_ns: int, seconds: float, out: Path) -> list[str]:
         """Raw frames of a camera of this machine to a folder."""
-        line = [sys.executable, "-m", "slave", "record", *self._place(camera)]
-        return [*line, *self._driver(camera, view, epoch_ns), "--seconds", f"{seconds:g}", "-o", str(out)]
+        line = self._slave("record", camera, view, epoch_ns)
+        return [*line, "--seconds", f"{seconds:g}", "-o", str(out)]
 
     def pi(self, camera: CameraPlan) -> tuple[str, str]:
         """Return the commands for a camera on a Pi: here to copy files, there to start."""
@@ -235,26 +210,17 @@ class Commands:
             own = [f"{keys}/./{file}" for file in files_of_device(camera.name)]
             copy += f" && rsync -aR {shlex.join(own)} {shlex.quote(host)}:keys/"
             secrets = ["--keys", "keys"]
-        slave = [
-            "phalanx-slave",
-            "run",
-            "--name",
-            camera.name,
-            "--rig",
-            self.plan.rig,
-            "--camera",
-            "picamera2",
-        ]
-        slave += ["--calibration", there, "--beacon-port", self._port, *secrets]
+        slave = ["phalanx-slave", "run", "--name", camera.name, "--rig", self.plan.rig]
+        slave += ["--camera", "picamera2", "--calibration", there, "--beacon-port", self._port, *secrets]
         return copy, shlex.join([*slave, *shlex.split(camera.options)])
 
     def meet(self) -> list[str]:
         """A master that tracks nothing."""
-        return [sys.executable, "-m", "master.console.setup.meet", *self._link()]
+        return [*_MODULE, "master.console.setup.meet", *self._link()]
 
     def run(self) -> list[str]:
         """The master that tracks."""
-        return [sys.executable, "-m", "master", "run", *self._link()]
+        return [*_MODULE, "master", "run", *self._link()]
 
     def calibrate(self, command: str, values: Mapping[str, Value], work: Path, *, live: bool) -> list[str]:
         """Return the command line of a calibration that writes below `work`.
@@ -275,32 +241,26 @@ class Commands:
             "json_file": str(work / "result.json"),
             "picture": str(work / "result.png"),
             "live": live,
-            "out": str(out_of(command, work)),
+            "out": str(work / _OUT.get(command, "tree")),
         }
         if command == "verify" and not values.get("source"):
             del known["picture"]  # what is to be expected is a table
         merged = {**values, **{name: value for name, value in known.items() if name in names}}
-        return [
-            sys.executable,
-            "-m",
-            "master",
-            *CALIBRATIONS[command].name.split(),
-            *arguments_of(fields, merged),
-        ]
+        words = CALIBRATIONS[command].name.split()
+        return [*_MODULE, "master", *words, *arguments_of(fields, merged)]
 
-    def _place(self, camera: CameraPlan) -> list[str]:
-        return ["--name", camera.name, "--rig", self.plan.rig, "--calibration", str(self.tree)]
-
-    def _driver(self, camera: CameraPlan, view: str, epoch_ns: int) -> list[str]:
+    def _slave(self, verb: str, camera: CameraPlan, view: str, epoch_ns: int) -> list[str]:
+        place = ["--name", camera.name, "--rig", self.plan.rig, "--calibration", str(self.tree)]
+        line = [*_MODULE, "slave", verb, *place]
         if camera.kind != "simulated":
             device = f":{camera.device}" if camera.device else ""
-            return ["--camera", f"v4l2{device}", *shlex.split(camera.options)]
+            return [*line, "--camera", f"v4l2{device}", *shlex.split(camera.options)]
         index = [one.name for one in self.plan.cameras].index(camera.name)
         apart_ms = 5.0  # cameras that nobody synchronises are taken one after the other
         late_ms = (time.monotonic_ns() - epoch_ns) * 1e-6 + apart_ms * index
         world = ["--truth", str(Path(self.plan.truth).resolve()), "--truth-rig", self.plan.world]
-        scene = ["--scene", "standard" if view == "still" else view, _CLOCK, str(epoch_ns)]
-        return ["--camera", "synthetic", *world, *scene, "--start-offset-ms", f"{late_ms:.3f}"]
+        scene = ["--scene", "standard" if view == "still" else view, "--scene-epoch-ns", str(epoch_ns)]
+        return [*line, "--camera", "synthetic", *world, *scene, "--start-offset-ms", f"{late_ms:.3f}"]
 
     def _link(self) -> list[str]:
         place = ["--rig", self.plan.rig, "--calibration", str(self.tree)]
@@ -320,24 +280,15 @@ def epoch_of(view: str) -> int:
     return time.monotonic_ns() + round(1e9 * later_s)
 
 
-def out_of(command: str, work: Path) -> Path:
-    """Return where a command writes: a page to print, pictures, or a tree of files."""
-    return {"board": work / "board.pdf", "cube": work / "box.pdf", "capture": work / "views"}.get(
-        command, work / "tree"
-    )
-
-
 def world_of_project() -> Path:
     """Return the calib_json tree of the simulated world, of the source or the cwd.
 
     Raises:
         CalibrationError: Neither is there.
     """
+    here = Path.cwd()
     for tree in (Path(__file__).resolve().parents[3] / "calib_json", Path("calib_json")):
-        path = tree / "rigs" / "desk.json"
-        if path.exists():
-            load(path, RigCalibration)
-            here = Path.cwd()
+        if (tree / "rigs" / "desk.json").exists():
             return tree.relative_to(here) if tree.is_relative_to(here) else tree
     raise CalibrationError(
         "no simulated world: the project's own calib_json is neither beside the source nor in the working folder;"

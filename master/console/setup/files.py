@@ -13,12 +13,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Literal
 
-import msgspec
 from msgspec import Meta
 from msgspec.structs import replace
 
 from common.bus.keys import new_key, rig_key
-from common.calibration import CameraCalibration, HandProfile, RigCalibration, load, save
+from common.calibration import CameraCalibration, RigCalibration, load, save
 from common.calibration.files import Part, replacing
 from common.errors import CalibrationError
 from common.hand.fitting import with_three_back_markers
@@ -76,6 +75,7 @@ def _usb_mode(width: int, height: int, rate_hz: float) -> Mode:
     return Mode(title, (width, height), rate_hz, 0.0, "row time not known", colour_gains=(1.0, 1.0))
 
 
+# fmt: off
 MODES: dict[Kind, dict[str, Mode]] = {
     "simulated": {},
     "pi": {
@@ -83,12 +83,9 @@ MODES: dict[Kind, dict[str, Mode]] = {
         "imx219": Mode("Camera Module 2 (IMX219)", (820, 616), 40.0, 37.8, "full view"),
         "imx219-fast": Mode("Camera Module 2 (IMX219), fast", (640, 480), 90.0, 18.9, "26° of the centre"),
         "imx708": Mode("Camera Module 3 (IMX708)", (1152, 648), 55.0, 26.7, "full view", focus_m=0.6),
-        "imx708-fast": Mode(
-            "Camera Module 3 (IMX708), fast", (768, 432), 115.0, 18.4, "two thirds of the width", focus_m=0.6
-        ),
-        "imx296": Mode(
-            "Global Shutter Camera (IMX296)", (728, 544), 60.0, 0.0, "full view, all rows at once"
-        ),
+        "imx708-fast": Mode("Camera Module 3 (IMX708), fast", (768, 432), 115.0, 18.4, "two thirds of the width",
+                            focus_m=0.6),
+        "imx296": Mode("Global Shutter Camera (IMX296)", (728, 544), 60.0, 0.0, "full view, all rows at once"),
     },
     "usb": {
         "vga60": _usb_mode(640, 480, 60.0),
@@ -97,6 +94,7 @@ MODES: dict[Kind, dict[str, Mode]] = {
         "hd60": _usb_mode(1280, 720, 60.0),
     },
 }
+# fmt: on
 SIMULATED = "as-simulated"
 
 
@@ -127,7 +125,6 @@ def new_file(kind: Kind, mode: str, name: str, truth: Path) -> CameraCalibration
     return MODES[kind][mode].file(name)
 
 
-OLD = "old"
 KEY_FILE = "rig.key"
 PLAN = Path("console") / "setup.json"
 MARKER_SETS: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -139,7 +136,6 @@ MARKER_SETS: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 # Simulated worlds, by how many cameras they have: rigs of the project's own calibration tree.
 WORLDS = {2: "desk", 4: "desk4"}
-WORLDS_EIGHT = {2: "desk-back3"}
 
 
 class CameraPlan(Part, frozen=True):
@@ -179,10 +175,9 @@ class Plan(Part, frozen=True):
     @property
     def world(self) -> str:
         """The rig of the simulated world."""
-        several = len(self.cameras) > 2
-        if self.marker_set == "eight" and not several:
-            return WORLDS_EIGHT[2]
-        return WORLDS[4 if several else 2]
+        if len(self.cameras) > 2:
+            return WORLDS[4]
+        return "desk-back3" if self.marker_set == "eight" else WORLDS[2]
 
 
 def load_plan(tree: Path) -> Plan:
@@ -211,15 +206,6 @@ def plan_of_rig(tree: Path, name: str) -> Plan:
     return Plan(rig=name, cameras=cameras, marker_set="eight" if "back2" in rig.markers else "six")
 
 
-def save_plan(tree: Path, plan: Plan) -> None:
-    """Keep the plan.
-
-    Raises:
-        CalibrationError: The folder cannot be written.
-    """
-    _save(tree / PLAN, plan)
-
-
 def write_cameras(tree: Path, plan: Plan) -> list[Path]:
     """Write plan and camera files; a file of the same mode keeps lens and colours.
 
@@ -237,21 +223,16 @@ def write_cameras(tree: Path, plan: Plan) -> list[Path]:
         new = new_file(camera.kind, camera.mode, camera.name, Path(plan.truth))
         if path.exists() and same_mode(load(path, CameraCalibration), new):
             continue
-        keep_old(tree, path)
-        _save(path, new)
+        replace_file(tree, path, new)
         written.append(path)
-    save_plan(tree, plan)
+    replace_file(tree, tree / PLAN, plan, keep=False)
     return written
 
 
 def same_mode(one: CameraCalibration, other: CameraCalibration) -> bool:
     """Return whether lens and colours hold for both: same size and read-out."""
-    return (one.width_px, one.height_px, one.row_time_us, one.focus_m) == (
-        other.width_px,
-        other.height_px,
-        other.row_time_us,
-        other.focus_m,
-    )
+    keys = ("width_px", "height_px", "row_time_us", "focus_m")
+    return all(getattr(one, key) == getattr(other, key) for key in keys)
 
 
 def write_rig(tree: Path, plan: Plan) -> list[Path]:
@@ -271,12 +252,10 @@ def write_rig(tree: Path, plan: Plan) -> list[Path]:
     )
     path, hand_path = tree / "rigs" / f"{plan.rig}.json", tree / "hands" / f"{plan.hand}.json"
     if path.exists() and (there := load(path, RigCalibration)).cameras == names and there.kind == "markers":
-        rig = msgspec.structs.replace(there, hand=plan.hand, markers=markers)
-    keep_old(tree, path)
-    keep_old(tree, hand_path)
-    _save(hand_path, hand)
-    _save(path, rig)
-    save_plan(tree, plan)
+        rig = replace(there, hand=plan.hand, markers=markers)
+    replace_file(tree, hand_path, hand)
+    replace_file(tree, path, rig)
+    replace_file(tree, tree / PLAN, plan, keep=False)
     return [hand_path, path, write_key(tree)]
 
 
@@ -307,42 +286,36 @@ def key_of(tree: Path, given: bytes | None) -> str:
     return (given if given is not None else rig_key({}, tree / KEY_FILE)).hex()
 
 
-def keep_old(tree: Path, path: Path) -> Path | None:
-    """Copy a file that is about to be replaced into old/DATE/; None if there is none.
+def keep_old(tree: Path, path: Path) -> None:
+    """Copy a file that is about to be replaced, if it is there, into old/DATE/.
 
     Raises:
         CalibrationError: It cannot be copied.
     """
     if not path.exists():
-        return None
-    folder = tree / OLD / datetime.now(UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
-    kept = folder / path.relative_to(tree)
+        return
+    kept = tree / "old" / datetime.now(UTC).strftime("%Y-%m-%dT%H-%M-%SZ") / path.relative_to(tree)
     try:
         kept.parent.mkdir(parents=True, exist_ok=True)
         kept.write_bytes(path.read_bytes())
     except OSError as error:
         raise CalibrationError(f"{kept}: cannot keep the old file: {error.strerror}") from error
-    return kept
 
 
-def replace_file(tree: Path, path: Path, content: bytes) -> None:
-    """Put a file into the tree, whole or not at all; the old one is kept.
+def replace_file(tree: Path, path: Path, content: bytes | Part, *, keep: bool = True) -> None:
+    """Put a file into the tree, whole or not at all; `keep`: the old one is kept.
 
     Raises:
         CalibrationError: It cannot be written.
     """
-    keep_old(tree, path)
+    if keep:
+        keep_old(tree, path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        if isinstance(content, Part):
+            save(path, content)
+            return
         with replacing(path) as file:
             file.write(content)
     except OSError as error:
         raise CalibrationError(f"{path}: cannot write: {error.strerror}") from error
-
-
-def _save(path: Path, value: Plan | CameraCalibration | RigCalibration | HandProfile) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise CalibrationError(f"{path.parent}: cannot make the folder: {error.strerror}") from error
-    save(path, value)

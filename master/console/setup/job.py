@@ -22,22 +22,14 @@ _COUNT = re.compile(r"\b(\d+) of (\d+)\b")
 _SHARE = re.compile(r"\b(\d{1,3}) %")
 
 
-def share_of(line: str) -> float | None:
-    """Return the share of work that a line reports as done, 0..1, or None."""
-    if found := _COUNT.search(line):
-        done, whole = int(found[1]), int(found[2])
-        return min(done / whole, 1.0) if whole else None
-    if found := _SHARE.search(line):
-        return min(int(found[1]) / 100, 1.0)
-    return None
-
-
 def progress(lines: Iterable[str]) -> float | None:
-    """Return the last share of work that any line reports; None if none does."""
+    """Return the share of work that the last line with one reports as done, 0..1."""
     last = None
     for line in lines:
-        share = share_of(line)
-        last = last if share is None else share
+        if (found := _COUNT.search(line)) and int(found[2]):
+            last = min(int(found[1]) / int(found[2]), 1.0)
+        elif found := _SHARE.search(line):
+            last = min(int(found[1]) / 100, 1.0)
     return last
 
 
@@ -137,14 +129,12 @@ class Job:
     @property
     def picture(self) -> Path | None:
         """A picture of the result, once there is one."""
-        pictures = sorted(self.work.glob("result*.png"))
-        return pictures[0] if pictures else None
+        return min(self.work.glob("result*.png"), default=None)
 
     @property
     def page(self) -> Path | None:
         """Something to print, once there is."""
-        pages = sorted([*self.work.glob("*.pdf"), *self.work.glob("*.svg")])
-        return pages[0] if pages else None
+        return min([*self.work.glob("*.pdf"), *self.work.glob("*.svg")], default=None)
 
     def results(self) -> list[Path]:
         """Calibration files that it made, below its own tree."""
@@ -179,7 +169,7 @@ class Job:
         results = self.results()
         if not results:
             raise CalibrationError(f"{self.title}: there is no result to use")
-        made: list[tuple[Path, bytes]] = []
+        made: dict[Path, bytes] = {}
         for file in results:
             name, content = file.relative_to(self.work / "tree"), file.read_bytes()
             if (kind := _KINDS.get(name.parts[0])) is not None:
@@ -189,11 +179,11 @@ class Job:
                 raise CalibrationError(
                     f"{there}: changed since this calibration began, and would lose that; start it again"
                 )
-            made.append((there, content))
-        for path, content in made:
+            made[there] = content
+        for path, content in made.items():
             replace_file(self.tree, path, content)
         self._before = _files(self.tree)
-        self.used = tuple(path for path, _ in made)
+        self.used = tuple(made)
         return self.used
 
     def _run(self) -> None:
@@ -219,7 +209,8 @@ class Job:
             failed = any(one.ended() not in (None, 0) for one in self._now.values())
             if failed or self._stop.wait(0.1):
                 break
-        codes = {name: self._end(name, one) for name, one in self._now.items()}
+        self._local.stop(*self._now)
+        codes = {name: one.ended() or 0 for name, one in self._now.items()}
         for one in self._now.values():
             self.lines.extend(one.lines)
         faults = [fault(self._now[name].lines) for name, code in codes.items() if code > 0]
@@ -232,15 +223,7 @@ class Job:
             self.state, self.error = JobState.FAILED, f"{stage.title}: it was killed"
         return self.state is JobState.RUNNING
 
-    def _end(self, name: str, process: LocalProcess) -> int:
-        code = process.ended()
-        self._local.stop(name)
-        return process.stop() if code is None else code
-
 
 def _files(tree: Path) -> dict[Path, bytes]:
-    found: dict[Path, bytes] = {}
-    for folder in _KINDS:
-        for path in (tree / folder).glob("*.json"):
-            found[path.relative_to(tree)] = path.read_bytes()
-    return found
+    paths = [path for folder in _KINDS for path in (tree / folder).glob("*.json")]
+    return {path.relative_to(tree): path.read_bytes() for path in paths}

@@ -6,9 +6,11 @@ from functools import partial
 from nicegui import ui
 
 from common.errors import PhalanxError
+from master.console.controls import Problem
 from master.console.setup import panel_cameras, panel_colours, panel_lens, panel_start
-from master.console.setup.parts import CSS, Desk
-from master.console.setup.session import Done, Session, Step, session_of, wizard_named
+from master.console.setup.parts import Desk
+from master.console.setup.session import Done, Step, session_of
+from master.console.setup.wizards import WIZARDS
 from master.console.state import ConsoleState
 
 PANELS: dict[str, Callable[[Desk], None]] = {
@@ -20,13 +22,15 @@ PANELS: dict[str, Callable[[Desk], None]] = {
     "track": panel_start.panel_track,
     "more": panel_lens.panel_more,
 }
-_ICONS = {Done.DONE: "check_circle", Done.TO_DO: "radio_button_unchecked", Done.STALE: "warning"}
-_COLOURS = {Done.DONE: "positive", Done.TO_DO: "grey", Done.STALE: "warning"}
+_ICONS = {
+    Done.DONE: ("check_circle", "positive"),
+    Done.TO_DO: ("radio_button_unchecked", "grey"),
+    Done.STALE: ("warning", "warning"),
+}
 
 
 def build(state: ConsoleState) -> None:
     """Fill the page."""
-    ui.add_css(CSS)
     try:
         session = session_of(state)
     except PhalanxError as error:
@@ -35,40 +39,32 @@ def build(state: ConsoleState) -> None:
     with ui.element("div").classes("setup"):
         nav = ui.element("nav").classes("setup-steps").props('aria-label="Steps of the set-up"')
         with ui.column().classes("setup-panel"):
-            error = ui.label().classes("setup-error").props('role="alert" data-testid="error"')
+            desk = Desk(session, Problem().classes(replace="setup-error").props('data-testid="error"'))
             panel = ui.column().classes("setup-panel w-full")
-
-    def complain(text: str) -> None:
-        error.set_text(text)
-
-    desk = Desk(session, lambda _key: None, complain)
-    steps = _Steps(session, nav, panel, desk)
+    steps = _Steps(nav, panel, desk)
     desk.go = steps.go
     steps.go(session.here or steps.first())
     ui.timer(1.0, steps.update)
 
 
 class _Steps:
-    def __init__(self, session: Session, nav: ui.element, panel: ui.column, desk: Desk) -> None:
-        self._session, self._nav, self._panel, self._desk = session, nav, panel, desk
+    def __init__(self, nav: ui.element, panel: ui.column, desk: Desk) -> None:
+        self._nav, self._panel, self._desk, self._session = nav, panel, desk, desk.session
         self._here = ""
         self._shown: object = None
 
     def first(self) -> str:
         """The first step that is not done; with all done, tracking."""
-        for step in self._all():
-            if step.state is not Done.DONE and step.key in PANELS:
-                return step.key
-        return "track"
+        return next((step.key for step in self._all() if step.state is not Done.DONE), "track")
 
     def go(self, key: str) -> None:
         """Open the panel of a step, or `wizard/COMMAND`."""
         self._here = self._session.here = key
-        self._desk.complain("")
+        self._desk.problem.set_text("")
         self._panel.clear()
         with self._panel:
             if key.startswith("wizard/"):
-                panel_lens.build_wizard(self._desk, wizard_named(key.removeprefix("wizard/")))
+                panel_lens.build_wizard(self._desk, WIZARDS[key.removeprefix("wizard/")])
             else:
                 PANELS[key](self._desk)
         self.update()
@@ -76,10 +72,9 @@ class _Steps:
     def update(self) -> None:
         """Show what is done now."""
         steps = self._all()
-        now = (steps, self._here)
-        if now == self._shown:
+        if (steps, self._here) == self._shown:
             return
-        self._shown = now
+        self._shown = (steps, self._here)
         self._nav.clear()
         with self._nav:
             for number, step in enumerate(steps, 1):
@@ -95,10 +90,9 @@ class _Steps:
         button.props(f'aria-label="Step {number}: {step.title}, {step.state}"')
         if step.key == self._here:
             button.props('aria-current="step" outline')
+        icon, colour = _ICONS[step.state]
         with button:
-            ui.icon(_ICONS[step.state], color=_COLOURS[step.state]).props("aria-hidden=true").classes(
-                "q-mr-sm"
-            )
+            ui.icon(icon, color=colour).props("aria-hidden=true").classes("q-mr-sm")
             with ui.column().classes("gap-0"):
                 ui.label(f"{number}. {step.title}")
                 ui.label(f"{step.state}: {step.why}").classes("setup-step-why")
@@ -112,7 +106,5 @@ class _Steps:
         why = "all run" if run else f"not there: {', '.join(absent)}" if absent else "choose them first"
         started = Step("start", "Start cameras", Done.DONE if run else Done.TO_DO, why)
         posing = any(pose.tracked.any() for pose in session.state.poses.values())
-        tracked = Step(
-            "track", "Track", *((Done.DONE, "a hand is tracked") if posing else (Done.TO_DO, "start it"))
-        )
-        return (*files[:2], started, *files[2:], tracked)
+        state, why = (Done.DONE, "a hand is tracked") if posing else (Done.TO_DO, "start it")
+        return (*files[:2], started, *files[2:], Step("track", "Track", state, why))

@@ -15,7 +15,6 @@ from master.console.setup.files import (
     KEY_FILE,
     KINDS,
     MARKER_SETS,
-    SIMULATED,
     WORLDS,
     CameraPlan,
     Kind,
@@ -52,15 +51,12 @@ def panel_cameras(desk: Desk) -> None:
     show()
 
     async def write() -> None:
-        desk.complain("")
         try:
             plan = rows.plan()
         except CalibrationError as error:
-            desk.complain(str(error))
-            return
-        done = await desk.attempt(lambda: desk.session.choose_cameras(plan) or True)
-        if done:
-            desk.go("rig")
+            desk.problem.show(str(error))
+        else:
+            await desk.attempt(lambda: desk.session.choose_cameras(plan), then="rig")
 
     ui.button("Write camera files", on_click=write).props('icon="save"')
 
@@ -94,18 +90,19 @@ class _Rows:
     def show(self) -> None:
         for place in range(len(self._cameras)):
             self._row(place)
-        if self.kind == "simulated":
-            if not self._truth:
-                try:
-                    self._truth = str(world_of_project())
-                except CalibrationError as error:
-                    ui.label(str(error)).classes("setup-error")
-            truth = ui.input("Folder of the simulated world", value=self._truth).classes("w-full max-w-xl")
-            truth.on_value_change(lambda event: self._see(event.value))
-            ui.label(
-                "Simulated cameras see a drawn hand. Their calibration is measured from their pictures, as with"
-                " real ones; only the paints and lenses of that world stand in its folder."
-            ).classes("setup-text")
+        if self.kind != "simulated":
+            return
+        if not self._truth:
+            try:
+                self._truth = str(world_of_project())
+            except CalibrationError as error:
+                ui.label(str(error)).classes("setup-error")
+        truth = ui.input("Folder of the simulated world", value=self._truth).classes("w-full max-w-xl")
+        truth.on_value_change(lambda event: setattr(self, "_truth", event.value or ""))
+        ui.label(
+            "Simulated cameras see a drawn hand. Their calibration is measured from their pictures, as with"
+            " real ones; only the paints and lenses of that world stand in its folder."
+        ).classes("setup-text")
 
     def plan(self) -> Plan:
         """What was entered.
@@ -113,49 +110,43 @@ class _Rows:
         Raises:
             CalibrationError: A name or a mode is missing.
         """
-        if any(not camera.name.strip() for camera in self._cameras):
-            raise CalibrationError("each camera needs a name")
+        for camera in self._cameras:
+            if not camera.name.strip() or camera.mode not in modes_of(camera.kind):
+                raise CalibrationError("each camera needs a name, a sensor and a mode")
         truth = str(Path(self._truth).resolve()) if self.kind == "simulated" else ""
         return replace(self._plan, cameras=tuple(self._cameras), truth=truth)
 
-    def _see(self, truth: str | None) -> None:
-        self._truth = truth or ""
-
     def _row(self, place: int) -> None:
-        camera = self._cameras[place]
+        camera, number = self._cameras[place], place + 1
 
-        def put(**values: str) -> None:
-            self._cameras[place] = replace(self._cameras[place], **values)
+        def put(key: str, value: object) -> None:
+            self._cameras[place] = replace(self._cameras[place], **{key: str(value or "").strip()})
 
-        number = f"of camera {place + 1}"
         with ui.row().classes("items-end w-full"):
-            name = ui.input(f"Name {number}", value=camera.name).classes("w-40")
-            name.on_value_change(lambda event: put(name=str(event.value or "")))
+            name = ui.input(f"Name of camera {number}", value=camera.name).classes("w-40")
+            name.on_value_change(lambda event: put("name", event.value))
+            modes = modes_of(camera.kind)
+            label = f"Sensor and mode of camera {number}"
+            mode = ui.select(modes, label=label, value=camera.mode if camera.mode in modes else None)
+            mode.classes("w-96").on_value_change(lambda event: put("mode", event.value))
             if camera.kind == "simulated":
                 name.props("readonly")
-            modes = modes_of(camera.kind)
-            chosen = camera.mode if camera.mode in modes else SIMULATED
-            mode = ui.select(modes, label=f"Sensor and mode {number}", value=chosen).classes("w-96")
-            mode.on_value_change(lambda event: put(mode=str(event.value)))
-            if camera.kind != "simulated":
-                device = ui.input(f"{_TALK[camera.kind]} ({place + 1})", value=camera.device).classes("w-80")
-                device.on_value_change(lambda event: put(device=str(event.value or "").strip()))
-                options = ui.input(f"More options of its slave ({place + 1})", value=camera.options).classes(
-                    "w-80"
-                )
-                options.on_value_change(lambda event: put(options=str(event.value or "").strip()))
-
-
-def _is_name(text: str) -> bool:
-    return re.fullmatch(r"[A-Za-z0-9_-]{1,32}", text) is not None
+                return
+            device = ui.input(f"{_TALK[camera.kind]} ({number})", value=camera.device).classes("w-80")
+            device.on_value_change(lambda event: put("device", event.value))
+            options = ui.input(f"More options of its slave ({number})", value=camera.options).classes("w-80")
+            options.on_value_change(lambda event: put("options", event.value))
 
 
 def panel_rig(desk: Desk) -> None:
     """Fill the panel."""
     plan = desk.session.plan
     heading("Markers and hand", "Which markers are painted, on whose hand. A measured hand can follow later.")
+    plain = re.compile(r"[A-Za-z0-9_-]{1,32}")
     name = ui.input(
-        "Name of the rig", value=plan.rig, validation={"letters, digits and - only": _is_name}
+        "Name of the rig",
+        value=plan.rig,
+        validation={"letters, digits and - only": lambda text: plain.fullmatch(text) is not None},
     ).classes("w-72")
     ui.label("Markers").props('id="setup-markers"')
     markers = ui.radio({key: title for key, (title, _) in MARKER_SETS.items()}, value=plan.marker_set)
@@ -166,15 +157,8 @@ def panel_rig(desk: Desk) -> None:
     status = ui.label()
     length = ui.slider(min=140, max=230, step=1, value=plan.length_mm).classes("w-96")
     length.props('aria-label="Length of the hand in millimetres" label')
-
-    def show_scale() -> None:
-        status.set_text(
-            f"Length of the hand: {length.value or 190:.0f} mm, from the crease of the wrist to the end of"
-            " the middle finger"
-        )
-
-    show_scale()
-    length.on_value_change(show_scale)
+    about = "Length of the hand: {:.0f} mm, from the crease of the wrist to the end of the middle finger"
+    status.bind_text_from(length, "value", about.format)
     key = desk.session.tree / KEY_FILE
     ui.label(
         f"Key: {key} {'is there' if key.exists() else 'will be made'}; it is the secret that all cameras of"
@@ -184,14 +168,12 @@ def panel_rig(desk: Desk) -> None:
     async def write() -> None:
         new = replace(
             plan,
-            rig=str(name.value or "desk"),
-            marker_set=str(markers.value),
-            side="left" if side.value == "left" else "right",
-            length_mm=float(length.value or 190.0),
+            rig=name.value,
+            marker_set=markers.value,
+            side=side.value,
+            length_mm=float(length.value or plan.length_mm),
         )
-        if not name.validate():
-            return
-        if await desk.attempt(lambda: desk.session.choose_rig(new) or True):
-            desk.go("start")
+        if name.validate():
+            await desk.attempt(lambda: desk.session.choose_rig(new), then="start")
 
     ui.button("Write rig and hand", on_click=write).props('icon="save"')

@@ -29,12 +29,11 @@ def panel_start(desk: Desk) -> None:
         chosen = session.view if session.view in VIEWS else "still"
         view = ui.select(VIEWS, label="What the simulated cameras look at", value=chosen).classes("w-96")
 
-    def go() -> bool:
+    def go() -> None:
         if here:
             session.start_cameras(session.view if view is None else str(view.value))
         if session.master is None and not session.foreign_master:
             session.start_master()
-        return True
 
     def end() -> None:
         session.stop_cameras()
@@ -65,11 +64,10 @@ def panel_track(desk: Desk) -> None:
     session = desk.session
     heading("Track", "The master estimates the hand from what the cameras see, and reports what is wrong.")
 
-    def go() -> bool:
+    def go() -> None:
         if not session.tracks:
             session.start_master()
         session.show("standard" if session.view in ("still", "board") else session.view)
-        return True
 
     with ui.row():
         ui.button("Start tracking", on_click=lambda: desk.attempt(go)).props('icon="play_arrow"')
@@ -77,39 +75,24 @@ def panel_track(desk: Desk) -> None:
         ui.button("See the hand", on_click=lambda: ui.navigate.to("/live")).props('flat icon="visibility"')
     status = ui.label().classes("text-h6").props('role="status" data-testid="tracking"')
     hands = ui.label().classes("setup-text")
-    items = ui.column().classes("w-full")
+    items = ui.label().classes("setup-text")
     wrong = ui.label().classes("setup-error").props('role="alert"')
-    shown: tuple[str, ...] | None = None
 
     def look() -> None:
-        nonlocal shown
-        state = session.state
-        poses = state.poses
-        status.set_text(_state(desk, any(pose.tracked.any() for pose in poses.values())))
-        hands.set_text("\n".join(sentence(pose) for pose in poses.values()))
+        poses, checklist = session.state.poses.values(), session.state.checklist
+        if any(pose.tracked.any() for pose in poses):
+            status.set_text("A hand is tracked")
+        elif session.tracks:
+            status.set_text("The master runs; it waits for cameras and a hand")
+        else:
+            met = "The cameras are met; nothing is tracked yet"
+            status.set_text(met if session.meets else "No master runs")
+        hands.set_text("\n".join(sentence(pose) for pose in poses))
         wrong.set_text("\n".join(session.failures()))
-        checklist = state.checklist
-        lines = () if checklist is None else tuple(f"{item.sentence} {item.fix}" for item in checklist.items)
-        lines = ("Checklist: all well",) if checklist is not None and not lines else lines
-        if lines != shown:
-            shown = lines
-            items.clear()
-            with items:
-                for line in lines:
-                    ui.label(line).classes("setup-text")
+        lines = [] if checklist is None else [f"{item.sentence} {item.fix}" for item in checklist.items]
+        items.set_text("\n".join(lines) or "Checklist: all well" * (checklist is not None))
 
     every(0.5, look)
-
-
-def _state(desk: Desk, posing: bool) -> str:
-    session = desk.session
-    if posing:
-        return "A hand is tracked"
-    if session.tracks:
-        return "The master runs; it waits for cameras and a hand"
-    if session.meets:
-        return "The cameras are met; nothing is tracked yet"
-    return "No master runs"
 
 
 def sentence(pose: HandPose) -> str:

@@ -3,49 +3,28 @@
 import base64
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TypeVar
 
-from nicegui import run, ui
+from nicegui import ui
 
-from common.errors import PhalanxError
-from master.console.controls import every
+from master.console.controls import CameraView, Problem, every
 from master.console.setup.job import Job, JobState
 from master.console.setup.session import Session
-
-T = TypeVar("T")
-_EMPTY = "data:image/gif;base64,R0lGODlhAQABAIAAAAAAAP///ywAAAAAAQABAAACAUwAOw=="
 
 
 @dataclass(slots=True)
 class Desk:
-    """One window of the set-up page.
-
-    `go` shows the panel of a step; `complain` shows an error until the next action, or none if empty.
-    """
+    """One window of the set-up page; `go` shows the panel of a step."""
 
     session: Session
-    go: Callable[[str], None]
-    complain: Callable[[str], None]
+    problem: Problem
+    go: Callable[[str], None] = lambda _: None
 
-    async def attempt(self, action: Callable[[], T]) -> T | None:
-        """Run a slow action off the event loop; an error is shown, and None is returned."""
-        self.complain("")
-        try:
-            return await run.io_bound(action)
-        except PhalanxError as error:
-            self.complain(str(error))
-            return None
-
-
-def jpeg_url(jpeg: bytes) -> str:
-    """A JPEG as the address of an image."""
-    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii")
-
-
-def png_url(png: bytes) -> str:
-    """A PNG as the address of an image."""
-    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+    async def attempt(self, action: Callable[[], object], then: str = "") -> bool:
+        """As `Problem.attempt`; the panel `then` follows where it succeeds."""
+        succeeded = await self.problem.attempt(action)
+        if succeeded and then:
+            self.go(then)
+        return succeeded
 
 
 def heading(title: str, text: str) -> None:
@@ -65,55 +44,19 @@ def command_line(about: str, text: str) -> None:
 
 def previews(desk: Desk) -> None:
     """What all cameras see now, side by side, while the panel is open."""
-    state = desk.session.state
+    state, shown = desk.session.state, dict[str, ui.label]()
     with ui.row().classes("setup-previews"):
-        shown = {camera.name: _preview(camera.name) for camera in desk.session.plan.cameras}
+        for camera in desk.session.plan.cameras:
+            with ui.column().classes("setup-preview"):
+                CameraView(camera.name, f"what {camera.name} sees")
+                shown[camera.name] = ui.label().props('aria-live="polite"')
 
     def update() -> None:
-        for name, (image, text) in shown.items():
-            state.look(name)
-            picture = state.preview(name)
-            if picture is not None:
-                image.set_source(jpeg_url(picture.jpeg))
-            there = name in state.alive
-            text.set_text(f"{name}: {'live' if picture else 'there' if there else 'waiting for it'}")
+        for name, text in shown.items():
+            words = "live" if state.preview(name) else "there" if name in state.alive else "waiting for it"
+            text.set_text(f"{name}: {words}")
 
-    ui.timer(0.2, update)
-
-
-def _preview(name: str) -> tuple[ui.image, ui.label]:
-    with ui.column().classes("setup-preview"):
-        image = (
-            ui.image(_EMPTY).props(f'alt="what {name} sees" no-spinner no-transition').classes("setup-image")
-        )
-        text = ui.label().props('aria-live="polite"')
-    return image, text
-
-
-CSS = """
-.setup { display: grid; grid-template-columns: 15rem minmax(0, 1fr); gap: 1.5rem; align-items: start; width: 100% }
-.setup-steps { display: flex; flex-direction: column; gap: .25rem; width: 100% }
-.setup-steps .q-btn__content { justify-content: flex-start; text-align: left; flex-wrap: nowrap; width: 100% }
-.setup-steps .q-btn { text-transform: none; width: 100% }
-.setup-step-why { font-size: .75rem; opacity: .75; line-height: 1.2; white-space: normal }
-.setup-panel { display: flex; flex-direction: column; gap: .75rem; min-width: 0 }
-.setup-text { max-width: 46rem; white-space: pre-line }
-.setup-error { color: var(--q-negative); font-weight: 600; white-space: pre-line }
-.setup-command { font-family: monospace; padding: .5rem; border: 1px solid currentColor; border-radius: 4px;
-  overflow-x: auto; white-space: pre; flex: 1; min-width: 0 }
-.setup-previews { gap: 1rem; width: 100% }
-.setup-preview { gap: .25rem; flex: 1 1 16rem; max-width: 26rem }
-.setup-image { width: 100%; min-height: 8rem; background: #8882 }
-.setup-lines { font-family: monospace; font-size: .8rem; white-space: pre-wrap; max-height: 16rem; overflow-y: auto;
-  width: 100%; padding: .5rem; background: #8882 }
-.setup-result { max-width: 100%; width: 52rem }
-.setup-cards { display: grid; grid-template-columns: repeat(auto-fill, minmax(15rem, 1fr)); gap: .75rem; width: 100% }
-.setup-cards .q-btn { text-transform: none }
-.body--dark .setup .q-btn--flat, .body--dark .setup .q-btn--outline { --q-primary: #8ab4f8 }
-.setup ol { list-style: decimal; padding-left: 1.5rem }
-.body--dark .setup-error { color: #ff8a80 }
-@media (max-width: 800px) { .setup { grid-template-columns: minmax(0, 1fr) } }
-"""
+    every(0.5, update)
 
 
 _HEAD = {
@@ -125,17 +68,12 @@ _HEAD = {
 
 
 def job_view(
-    desk: Desk,
-    job: Callable[[], Job | None],
-    used: Callable[[], None],
-    *,
-    words: Callable[[Job], str] = lambda _job: "",
-    early: bool = False,
+    desk: Desk, key: str, *, words: Callable[[Job], str] = lambda _: "", early: bool = False, then: str = ""
 ) -> None:
-    """Build the view of progress, output, buttons and result of what `job` returns.
+    """Build the view of progress, output, buttons and result of the job `key`.
 
-    `used` is called once its result was taken over; `words` states what it means, for a person; `early`: what
-    runs can be ended early and still be used.
+    `words` states what its result means, for a person; `early`: what runs can be ended early and still be
+    used; the panel `then` follows once the result was taken over.
     """
     shown: tuple[int, JobState] | None = None
     with ui.column().classes("w-full") as box:
@@ -148,73 +86,68 @@ def job_view(
 
     def follow() -> None:
         nonlocal shown
-        now = job()
-        box.set_visibility(now is not None)
-        if now is None:
+        job = desk.session.jobs.get(key)
+        box.set_visibility(job is not None)
+        if job is None:
             return
-        text = [line for line in now.text if line.strip()]
-        running = now.state is JobState.RUNNING
-        stage.set_text(f"{now.title}: {now.stage if running and now.stage else _HEAD[now.state]}")
-        share = now.share
-        bar.props(f"{'' if share is not None or not running else 'indeterminate'}", remove="indeterminate")
-        bar.set_value(0.0 if share is None else share)
+        text = [line for line in job.text if line.strip()]
+        running = job.state is JobState.RUNNING
+        stage.set_text(f"{job.title}: {job.stage if running and job.stage else _HEAD[job.state]}")
+        share = job.share
+        bar.props("indeterminate" if share is None and running else "", remove="indeterminate")
+        bar.set_value(share or 0.0)
         last.set_text(text[-1] if running and text else "")
-        # shown
         lines.set_text("\n".join(text[-60:]))
         lines.set_visibility(bool(text))
-        if (id(now), now.state) != shown:
-            shown = (id(now), now.state)
-            _buttons(desk, buttons, now, early=early)
-            result.clear()
+        if (id(job), job.state) == shown:
+            return
+        shown = (id(job), job.state)
+        buttons.clear()
+        result.clear()
+        if running:
+            with buttons:
+                _buttons(desk, job, early=early)
+        else:
             with result:
-                if not running:
-                    _result(desk, now, used, words)
+                _result(desk, job, words, then)
 
     every(0.4, follow)
 
 
-def _buttons(desk: Desk, row: ui.row, job: Job, *, early: bool) -> None:
-    row.clear()
-    if job.state is not JobState.RUNNING:
-        return
-
-    with row:
-        if early:
-            ui.button("That is enough", on_click=lambda: desk.attempt(job.finish)).props('flat icon="done"')
-        ui.button("Next", on_click=lambda: desk.attempt(job.send)).props(
-            'icon="keyboard_return"'
-        ).bind_visibility_from(job, "keyboard")
-        ui.button("Cancel", on_click=lambda: desk.attempt(job.cancel)).props('flat icon="close"')
+def _buttons(desk: Desk, job: Job, *, early: bool) -> None:
+    if early:
+        ui.button("That is enough", on_click=lambda: desk.attempt(job.finish)).props('flat icon="done"')
+    following = ui.button("Next", on_click=lambda: desk.attempt(job.send)).props('icon="keyboard_return"')
+    following.bind_visibility_from(job, "keyboard")
+    ui.button("Cancel", on_click=lambda: desk.attempt(job.cancel)).props('flat icon="close"')
 
 
-def _result(desk: Desk, job: Job, used: Callable[[], None], words: Callable[[Job], str]) -> None:
+def _result(desk: Desk, job: Job, words: Callable[[Job], str], then: str) -> None:
     if job.state is JobState.FAILED:
         ui.label(job.error).classes("setup-error").props('role="alert"')
-        return
     if job.state is not JobState.DONE:
         return
     if text := words(job):
         ui.label(text).classes("text-subtitle1 setup-text").props('role="status" data-testid="verdict"')
     if (picture := job.picture) is not None:
-        image = ui.image(png_url(picture.read_bytes())).classes("setup-result")
+        png = base64.b64encode(picture.read_bytes()).decode("ascii")
+        image = ui.image(f"data:image/png;base64,{png}").classes("setup-result")
         image.props(f'alt="Result of {job.title}: what was seen, and what is left of it" fit=contain')
     if (page := job.page) is not None:
-        ui.button(f"Download {page.name}", on_click=lambda: _download(page)).props('icon="download"')
-    if not job.results():
+        download = ui.button(f"Download {page.name}").props('icon="download"')
+        download.on_click(lambda: ui.download.content(page.read_bytes(), page.name))
+    if not (results := job.results()):
         return
-    names = ", ".join(str(path.relative_to(job.work / "tree")) for path in job.results())
+    names = ", ".join(str(path.relative_to(job.work / "tree")) for path in results)
     ui.label(f"New: {names}. The files before are kept under {job.tree / 'old'}.").classes("setup-text")
 
     async def use() -> None:
         if await desk.attempt(lambda: desk.session.use(job)):
             button.disable()
             ui.notify("In use", type="positive")
-            used()
+            if then:
+                desk.go(then)
 
     button = ui.button("Use it", on_click=use).props('icon="check"')
     if job.used:
         button.disable()
-
-
-def _download(page: Path) -> None:
-    ui.download.content(page.read_bytes(), page.name)

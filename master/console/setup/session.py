@@ -5,6 +5,7 @@ console, with the cameras, master and calibrations that the page started. Its me
 them off the event loop.
 """
 
+import functools
 import logging
 import threading
 from collections.abc import Callable, Mapping
@@ -20,7 +21,7 @@ from master.console.local import LocalProcess
 from master.console.setup.commands import Commands, Value, epoch_of
 from master.console.setup.files import KEY_FILE, Plan, load_plan, plan_of_rig, write_cameras, write_rig
 from master.console.setup.job import Job, JobState, Stage, fault
-from master.console.setup.wizards import WIZARDS, Wizard, recording_stages
+from master.console.setup.wizards import Wizard, recording_stages
 from master.console.state import ConsoleState
 
 
@@ -44,47 +45,35 @@ class Step:
 
 def steps_of(tree: Path, plan: Plan, *, keyed: bool = False) -> tuple[Step, ...]:
     """Return the steps whose results are files; `keyed`: the tree needs no key."""
-    cameras, broken = _cameras(tree, plan)
-    rig, rig_error = _rig(tree, plan)
+    cameras: dict[str, CameraCalibration] = {}
+    rig, broken, rig_broken = None, "", ""
+    try:
+        for camera in plan.cameras:
+            path = tree / "cameras" / f"{camera.name}.json"
+            if path.exists():
+                cameras[camera.name] = load(path, CameraCalibration)
+    except CalibrationError as error:
+        broken = str(error)
+    try:
+        path = tree / "rigs" / f"{plan.rig}.json"
+        rig = load(path, RigCalibration) if path.exists() else None
+    except CalibrationError as error:
+        rig_broken = str(error)
     return (
         Step("cameras", "Choose cameras", *_chosen(plan, cameras, broken)),
-        Step("rig", "Markers and hand", *_named(tree, plan, rig, rig_error, keyed=keyed)),
+        Step("rig", "Markers and hand", *_named(tree, plan, rig, rig_broken, keyed=keyed)),
         Step("lens", "Lenses and places", *_measured(plan, cameras, rig)),
         Step("colours", "Colours of the markers", *_coloured(plan, cameras, rig)),
     )
 
 
-def _cameras(tree: Path, plan: Plan) -> tuple[dict[str, CameraCalibration], str]:
-    found: dict[str, CameraCalibration] = {}
-    for camera in plan.cameras:
-        path = tree / "cameras" / f"{camera.name}.json"
-        if path.exists():
-            try:
-                found[camera.name] = load(path, CameraCalibration)
-            except CalibrationError as error:
-                return found, str(error)
-    return found, ""
-
-
-def _rig(tree: Path, plan: Plan) -> tuple[RigCalibration | None, str]:
-    path = tree / "rigs" / f"{plan.rig}.json"
-    if not path.exists():
-        return None, ""
-    try:
-        return load(path, RigCalibration), ""
-    except CalibrationError as error:
-        return None, str(error)
-
-
 def _chosen(plan: Plan, cameras: Mapping[str, CameraCalibration], broken: str) -> tuple[Done, str]:
     if broken:
         return Done.STALE, f"{broken}; write the cameras again"
-    missing = [camera.name for camera in plan.cameras if camera.name not in cameras]
-    if not plan.cameras or missing:
-        return Done.TO_DO, f"no file of {', '.join(missing)}" if missing else "how many cameras, and which?"
-    return Done.DONE, ", ".join(
-        f"{name} {file.width_px} x {file.height_px}" for name, file in cameras.items()
-    )
+    if missing := [camera.name for camera in plan.cameras if camera.name not in cameras]:
+        return Done.TO_DO, f"no file of {', '.join(missing)}"
+    sizes = [f"{name} {file.width_px} x {file.height_px}" for name, file in cameras.items()]
+    return (Done.DONE, ", ".join(sizes)) if sizes else (Done.TO_DO, "how many cameras, and which?")
 
 
 def _named(
@@ -186,11 +175,6 @@ class Session:
         """Whether a master tracks that the console did not start."""
         return self.master is None and MASTER in self.state.alive
 
-    @property
-    def busy(self) -> Job | None:
-        """The job that runs, if any."""
-        return next((job for job in self.jobs.values() if job.state is JobState.RUNNING), None)
-
     def steps(self) -> tuple[Step, ...]:
         """The steps whose results are files."""
         return steps_of(self.tree, self.plan, keyed=self.state.settings.key is not None)
@@ -207,14 +191,13 @@ class Session:
     def choose_cameras(self, plan: Plan) -> None:
         """Write camera files; a rig that is there already gets the cameras, too.
 
-        Raises:
-            CalibrationError: As of `write_cameras`.
+        Raises as `write_cameras` and `write_rig`.
         """
         with self._lock:
             write_cameras(self.tree, plan)
             self._stop_own()
             self.plan = plan
-            if (self.tree / "rigs" / f"{plan.rig}.json").exists():
+            if self.state.rig_path(plan.rig).exists():
                 write_rig(self.tree, plan)
 
     def choose_rig(self, plan: Plan) -> None:
@@ -257,12 +240,7 @@ class Session:
 
     def stop_cameras(self) -> None:
         """End the cameras of this machine."""
-        with self._lock:
-            running = [threading.Thread(target=one.stop) for one in self.cameras_running.values()]
-            for thread in running:
-                thread.start()
-            for thread in running:
-                thread.join()
+        self.state.local.stop(*self.cameras_running)
 
     def start_master(self) -> None:
         """Start the master; while lenses or places are unknown it only meets cameras.
@@ -294,12 +272,9 @@ class Session:
             self._refuse_busy()
             work = self._work(LENS)
             capture = self.commands.calibrate("capture", values, work, live=False)
-            board: dict[str, Value] = {
-                name: value for name, value in values.items() if name in _OF_BOARD and value not in (None, "")
-            }
-            stereo = self.commands.calibrate(
-                "stereo", {**board, "source": str(work / "views")}, work, live=False
-            )
+            board = {name: values[name] for name in _OF_BOARD if values.get(name) not in (None, "")}
+            source = {"source": str(work / "views")}
+            stereo = self.commands.calibrate("stereo", board | source, work, live=False)
             self.show("board")
             self._bring_back = (True, True)
             stages = [
@@ -340,8 +315,7 @@ class Session:
     def use(self, job: Job) -> tuple[Path, ...]:
         """Write a job's results into the tree; a master that met cameras then tracks.
 
-        Raises:
-            PhalanxError: As of `Job.use` and `start_master`.
+        Raises as `Job.use` and `start_master`.
         """
         written = job.use()
         if self.meets:
@@ -351,28 +325,23 @@ class Session:
     @property
     def meets(self) -> bool:
         """Whether the console's own master runs and only meets the cameras."""
-        return (master := self.master) is not None and master.command == tuple(self.commands.meet())
+        return self._master_is(self.commands.meet())
 
     @property
     def tracks(self) -> bool:
         """Whether a master tracks, the console's own or another."""
-        own = (master := self.master) is not None and master.command == tuple(self.commands.run())
-        return own or self.foreign_master
+        return self._master_is(self.commands.run()) or self.foreign_master
+
+    def _master_is(self, command: list[str]) -> bool:
+        master = self.master
+        return master is not None and master.command == tuple(command)
 
     def _begin(
         self, key: str, title: str, stages: list[Callable[[], Stage]], work: Path, *, keyed: bool = True
     ) -> Job:
-        job = Job(
-            title,
-            stages,
-            self.state.local,
-            self.commands.environment() if keyed else {},
-            self.tree,
-            work,
-            self._after,
-        )
-        self.jobs[key] = job
-        return job
+        environment = self.commands.environment() if keyed else {}
+        self.jobs[key] = Job(title, stages, self.state.local, environment, self.tree, work, self._after)
+        return self.jobs[key]
 
     def _after(self) -> None:
         """Restore the cameras and the master that a job borrowed."""
@@ -392,11 +361,12 @@ class Session:
         self.stop_master()
 
     def _refuse_busy(self) -> None:
-        if (job := self.busy) is not None:
-            raise CalibrationError(f"{job.title} runs: finish or cancel it first")
+        for job in self.jobs.values():
+            if job.state is JobState.RUNNING:
+                raise CalibrationError(f"{job.title} runs: finish or cancel it first")
 
     def _needs_rig(self) -> None:
-        if not self.plan.cameras or not (self.tree / "rigs" / f"{self.plan.rig}.json").exists():
+        if not self.plan.cameras or not self.state.rig_path(self.plan.rig).exists():
             raise CalibrationError("choose cameras, markers and hand first (steps 1 and 2)")
 
     def _work(self, name: str) -> Path:
@@ -407,24 +377,14 @@ class Session:
 _OF_BOARD = ("board", "square_mm", "marker_mm", "dictionary")
 
 
+@functools.cache
 def session_of(state: ConsoleState) -> Session:
-    """The session of a console.
+    """The one session of a console, for all its windows.
 
     Raises:
         CalibrationError: The plan's file is broken.
     """
-    return state.local.shared(Session, lambda: Session(state))
-
-
-def wizard_named(command: str) -> Wizard:
-    """The wizard of a command.
-
-    Raises:
-        CalibrationError: There is none.
-    """
-    if command not in WIZARDS:
-        raise CalibrationError(f"no calibration {command!r}; there are {', '.join(WIZARDS)}")
-    return WIZARDS[command]
+    return Session(state)
 
 
 def _plan(state: ConsoleState) -> Plan:

@@ -11,26 +11,15 @@ from typing import Literal
 
 from common.errors import CalibrationError
 from master.console.setup.commands import Commands, Value, epoch_of
+from master.console.setup.files import Plan
 from master.console.setup.job import Stage
 
 Master = Literal["none", "capture", "run"]
-Prepared = Literal["", "markers", "wrist", "both", "strobed"]
+Prepared = Literal["", "markers", "wrist"]
 
 # Fields that the page fills in by itself, for every command that has them.
-FILLED = frozenset(
-    (
-        "calibration",
-        "out",
-        "json_file",
-        "picture",
-        "rig",
-        "beacon",
-        "bind",
-        "bus",
-        "key_file",
-        "live",
-        "steps",
-    )
+FILLED = frozenset({"calibration", "out", "json_file", "picture", "rig", "live", "steps"}) | frozenset(
+    {"beacon", "bind", "bus", "key_file"}
 )
 
 
@@ -47,10 +36,9 @@ class Wizard:
         keyboard: Whether it waits for Enter between its steps.
         first: Fields shown at once, in this order; the others are under "More options".
         defaults: What fields begin with, where that is not the command's own default.
-        prepared: What a recording is made of first: marker cameras, strobe cycles ..., "" for none.
+        prepared: Whose recording it needs: the marker cameras', that of a wrist device; "" for none.
         scene: What simulated cameras show meanwhile.
         seconds: How long a recording is made.
-        writes: What it writes that a person may print or download, beside calibration files.
     """
 
     command: str
@@ -66,12 +54,12 @@ class Wizard:
     prepared: Prepared = ""
     scene: str = "standard"
     seconds: float = 0.0
-    writes: str = ""
 
 
 _BOARD = ("board", "square_mm")
 _SOURCE = ("source", *_BOARD)
 _RECORD = ("recording", "detections")
+_FIT = ("Choose the folder of the pictures.", "Start, look at the residuals, use the result.")
 
 # fmt: off
 _CAMERAS = (
@@ -79,7 +67,7 @@ _CAMERAS = (
         "board", "Board to print", "A chessboard or ChArUco board at true scale, with a ruler.",
         "A printer, and something flat and stiff to glue the print on.",
         ("Choose the paper.", "Print at 100 %, not “fit to page”.", "Measure the ruler: it must be 100 mm."),
-        first=("kind", "paper"), writes="board.pdf",
+        first=("kind", "paper"),
     ),
     Wizard(
         "capture", "Pictures of a board",
@@ -95,14 +83,14 @@ _CAMERAS = (
         "stereo", "Lenses and places of cameras",
         "Where all cameras of the rig stand, and their lenses, in one fit.",
         "Pictures of a board (the calibration before this one).",
-        ("Choose the folder of the pictures.", "Start, look at the residuals, use the result."),
+        _FIT,
         first=_SOURCE,
     ),
     Wizard(
         "intrinsics", "Lens of one camera",
         "The lens of a camera by itself, as a wrist device's, without moving the others.",
         "Pictures of a board by that camera.",
-        ("Choose the folder of the pictures.", "Start, look at the residuals, use the result."),
+        _FIT,
         first=(*_SOURCE, "camera"),
     ),
 )
@@ -146,7 +134,7 @@ _WRIST = (
             "Hold the board still so that the laser crosses it, at 15 to 35 cm.",
             "Ten views, near and far, tilted.",
         ),
-        first=("source", *_BOARD), defaults={"board": "9x6", "square_mm": 15.0}, prepared="strobed",
+        first=("source", *_BOARD), defaults={"board": "9x6", "square_mm": 15.0}, prepared="wrist",
         scene="board", seconds=20.0,
     ),
     Wizard(
@@ -154,7 +142,7 @@ _WRIST = (
         "How bright paper looks in every part of the image.",
         "The wrist camera's lens; a board on matt paper; a recording with the strobe on.",
         ("Show the board everywhere, in the corners too, facing the camera, still.", "Twenty views."),
-        first=("source", *_BOARD), defaults={"board": "9x6", "square_mm": 15.0}, prepared="strobed",
+        first=("source", *_BOARD), defaults={"board": "9x6", "square_mm": 15.0}, prepared="wrist",
         scene="board", seconds=30.0,
     ),
     Wizard(
@@ -162,7 +150,7 @@ _WRIST = (
         "The wrist camera's lens; a small board on palm and straight fingers.",
         ("Lay the board on the palm, print to the camera, columns along the middle finger.", "Record it."),
         first=("source", *_BOARD, "wrist_mm", "depth_mm"),
-        defaults={"board": "7x4", "square_mm": 10.0, "wrist_mm": 70.0, "depth_mm": 22.0}, prepared="strobed",
+        defaults={"board": "7x4", "square_mm": 10.0, "wrist_mm": 70.0, "depth_mm": 22.0}, prepared="wrist",
         scene="board", seconds=3.0,
     ),
     Wizard(
@@ -189,7 +177,7 @@ _WRIST = (
             "Bend fingers one by one and together, bend the wrist both ways, turn the forearm about all its axes.",
             "Briskly: each to and fro about once a second; ten seconds.",
         ),
-        first=_RECORD, prepared="both", scene="both-moves", seconds=10.0,
+        first=_RECORD, prepared="wrist", scene="both-moves", seconds=10.0,
     ),
 )
 _OBJECTS = (
@@ -204,7 +192,7 @@ _OBJECTS = (
         "cube", "Box of tags to print", "A box of tags at true scale, and its object file.",
         "A printer, a box of that size.",
         ("Choose name and sides.", "Print at 100 %, measure the ruler.", "Glue it round the box."),
-        first=("name", "side_mm", "edge_mm"), writes="box.pdf",
+        first=("name", "side_mm", "edge_mm"),
     ),
     Wizard(
         "tracker", "Tracking system (Vive)",
@@ -224,6 +212,16 @@ GROUPS: dict[str, tuple[Wizard, ...]] = {
 WIZARDS: dict[str, Wizard] = {wizard.command: wizard for group in GROUPS.values() for wizard in group}
 
 
+def no_recording(plan: Plan, wizard: Wizard) -> str:
+    """Why the page cannot make a wizard's recording itself; empty if it can."""
+    there = "phalanx-slave record (docs/recording.md); then give the folder here"
+    if elsewhere := [camera.name for camera in plan.cameras if camera.kind == "pi"]:
+        return f"{', '.join(elsewhere)}: records on its own machine: {there}"
+    if wizard.prepared != "markers":
+        return f"{wizard.title}: the recording is of a wrist device: {there}"
+    return ""
+
+
 def recording_stages(
     commands: Commands, wizard: Wizard, values: Mapping[str, Value], work: Path
 ) -> tuple[list[Callable[[], Stage]], dict[str, Value]]:
@@ -232,40 +230,30 @@ def recording_stages(
     Raises:
         CalibrationError: A camera is not on this machine, or the wizard needs no recording of these cameras.
     """
+    if reason := no_recording(commands.plan, wizard):
+        raise CalibrationError(reason)
     cameras = commands.plan.cameras
-    elsewhere = [camera.name for camera in cameras if camera.kind == "pi"]
-    if elsewhere:
-        raise CalibrationError(
-            f"{', '.join(elsewhere)}: records on its own machine: phalanx-slave record (docs/recording.md); then give"
-            " the folder here"
-        )
-    if wizard.prepared != "markers":
-        raise CalibrationError(
-            f"{wizard.title}: the recording is of a wrist device: phalanx-slave record (docs/recording.md); then give"
-            " the folder here"
-        )
     raw, whole, found = work / "raw", work / "recording", work / "found"
+    slave = [sys.executable, "-m", "slave"]
 
     def record() -> Stage:
         epoch_ns = epoch_of(wizard.scene)
         lines = {
-            f"camera {camera.name}": commands.record(
-                camera, wizard.scene, epoch_ns, wizard.seconds, raw / camera.name
-            )
-            for camera in cameras
+            f"camera {one.name}": commands.record(one, wizard.scene, epoch_ns, wizard.seconds, raw / one.name)
+            for one in cameras
         }
         return Stage(f"recording {wizard.seconds:.0f} s", lines)
 
     def join() -> Stage:
         folders = [str(raw / camera.name) for camera in cameras]
-        line = [sys.executable, "-m", "slave", "record", "--join", *folders, "-o", str(whole)]
+        line = [*slave, "record", "--join", *folders, "-o", str(whole)]
         return Stage("joining the recordings", {"join": line})
 
     def detect() -> Stage:
         found.mkdir(parents=True, exist_ok=True)
         lines = {
             f"detect {camera.name}": [
-                *(sys.executable, "-m", "slave", "run", "--name", camera.name, "--camera", f"replay:{whole}"),
+                *(*slave, "run", "--name", camera.name, "--camera", f"replay:{whole}"),
                 *("--calibration", str(commands.tree)),
                 *("-o", str(found / f"detections_{camera.name}.npz")),
             ]

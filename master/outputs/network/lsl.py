@@ -16,10 +16,10 @@ import logging
 import os
 import socket
 import sys
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import ClassVar, Protocol, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
@@ -57,9 +57,8 @@ def keep_here(before: Collection[Socket], ports: range) -> bool:
     Returns:
         Whether each is bound; False: there is one that is not, or the system cannot determine it, or do it.
     """
-    bound = [
-        _bound(one) for one in _listening((number for number, _ in sockets() - frozenset(before)), ports)
-    ]
+    opened = (number for number, _ in sockets() - frozenset(before))
+    bound = [_bound(one) for one in _listening(opened, ports)]
     return bool(bound) and all(bound)
 
 
@@ -101,46 +100,8 @@ ListenAddress = 127.0.0.1
 """
 
 
-class _XmlElement(Protocol):
-    def append_child(self, name: str) -> "_XmlElement": ...
-    def append_child_value(self, name: str, value: str) -> "_XmlElement": ...  # this one, not the child
-
-
-class _Info(Protocol):
-    def desc(self) -> _XmlElement: ...
-
-
-class _Outlet(Protocol):
-    """A stream that this process offers until nothing holds it any more."""
-
-    def push_sample(self, x: Sequence[float], timestamp: float) -> None: ...  # [s] on `local_clock`
-
-
-class _Library(Protocol):
-    """The module `pylsl`."""
-
-    IRREGULAR_RATE: float
-    cf_float32: int
-
-    def StreamInfo(
-        self,
-        name: str,
-        type: str,  # noqa: A002
-        channel_count: int,
-        nominal_srate: float,
-        channel_format: int,
-        source_id: str,
-    ) -> _Info: ...
-
-    # For a slow inlet it keeps `max_buffered` * 100 samples. Raises `RuntimeError`.
-    def StreamOutlet(self, info: _Info, chunk_size: int, max_buffered: int) -> _Outlet: ...
-    def local_clock(self) -> float: ...  # [s]
-    # Once, before anything else. Raises `NotImplementedError` before liblsl 1.17.7.
-    def set_config_content(self, content: str) -> None: ...
-
-
-def load_library(scope: str, bound_scope: str | None) -> _Library:
-    """Import the module and set who can find its streams, "machine" or "network".
+def load_library(scope: str, bound_scope: str | None) -> Any:
+    """Import `pylsl` and set who can find its streams, "machine" or "network".
 
     `bound_scope`: what liblsl was configured with before in this process, which is for ever; None: nothing
     yet.
@@ -149,19 +110,17 @@ def load_library(scope: str, bound_scope: str | None) -> _Library:
         PhalanxError: It is not installed, has no liblsl, or one that is too old or was configured otherwise.
     """
     try:
-        library = cast(_Library, importlib.import_module("pylsl"))
+        library = cast(Any, importlib.import_module("pylsl"))
     except ImportError as error:
         raise PhalanxError(f"pylsl is not installed: {INSTALL}") from error
     except (OSError, RuntimeError) as error:  # liblsl is loaded at once
         raise PhalanxError(f"pylsl finds no liblsl that runs here: {INSTALL}") from error
-    if bound_scope is not None:
-        if bound_scope != scope:
-            raise PhalanxError(
-                f"lsl.scope is {scope!r}, but liblsl began with {bound_scope!r} in this process: start"
-                " `phalanx send` anew"
-            )
-        return library
-    if scope == "machine":
+    if bound_scope not in (None, scope):
+        raise PhalanxError(
+            f"lsl.scope is {scope!r}, but liblsl began with {bound_scope!r} in this process: start"
+            " `phalanx send` anew"
+        )
+    if bound_scope is None and scope == "machine":
         try:
             library.set_config_content(_MACHINE)
         except NotImplementedError as error:
@@ -202,10 +161,10 @@ class LslSink:
 
     def __init__(self, settings: LslOutput, times: MasterTimes) -> None:
         """Load the library; PhalanxError: it, or liblsl, is missing."""
-        self._library: _Library = load_library(settings.scope, LslSink._bound_scope)
+        self._library = load_library(settings.scope, LslSink._bound_scope)
         LslSink._bound_scope = settings.scope
         self._name, self._scope, self._times = settings.name, settings.scope, times
-        self._outlets: dict[str, _Outlet] = {}
+        self._outlets: dict[str, Any] = {}
         self._clock = self._compared()
 
     def write(self, message: ResultMessage) -> None:
@@ -225,34 +184,28 @@ class LslSink:
         """Take the streams back: an outlet ends with the last that holds it."""
         self._outlets.clear()
 
-    def _opened(self, hand: str) -> _Outlet:
+    def _opened(self, hand: str) -> Any:
         rows = channels()
         # The same hand of the same machine is the same source: an inlet takes it up again after a restart.
         source = f"phalanx-{socket.gethostname()}-{hand}"
-        info = self._library.StreamInfo(
-            f"{self._name}-{hand}",
-            "MoCap",
-            len(rows),
-            self._library.IRREGULAR_RATE,
-            self._library.cf_float32,
-            source,
+        library, name = self._library, f"{self._name}-{hand}"
+        info = library.StreamInfo(
+            name, "MoCap", len(rows), library.IRREGULAR_RATE, library.cf_float32, source
         )
         description = info.desc()
         description.append_child_value("manufacturer", "Phalanx").append_child_value("hand", hand)
         description.append_child_value("frame", "rig: of the reference camera, x right, y down, z forward")
         listed = description.append_child("channels")
         for label, kind, unit in rows:
-            listed.append_child("channel").append_child_value("label", label).append_child_value(
-                "type", kind
-            ).append_child_value("unit", unit)
+            channel = listed.append_child("channel")
+            for key, value in (("label", label), ("type", kind), ("unit", unit)):
+                channel.append_child_value(key, value)
         before = sockets()
         try:
             buffered = 60  # hundreds of samples, for an inlet that is slow
-            outlet = self._library.StreamOutlet(info, 0, buffered)
+            outlet = library.StreamOutlet(info, 0, buffered)
         except RuntimeError as error:
-            raise PhalanxError(
-                f"{self._name}-{hand}: {error}; are ports {PORTS[0]} to {PORTS[-1]} free?"
-            ) from error
+            raise PhalanxError(f"{name}: {error}; are ports {PORTS[0]} to {PORTS[-1]} free?") from error
         if self._scope == "machine" and not keep_here(before, PORTS):
             _LOG.warning(
                 "lsl: liblsl listens on every network, and this system cannot keep it to itself: let a firewall"

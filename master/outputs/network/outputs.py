@@ -7,19 +7,18 @@ and counted.
 """
 
 import os
-import threading
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 
 from common.bus.endpoints import loopback
 from common.calibration.output_settings import OutputPart, OutputSettings
-from common.clock import Clock, SystemClock
 from common.errors import PhalanxError
 from common.messages import Contact, Gesture, HandPose, ObjectPose, ResultMessage
 from master.outputs.bus import Sink
 from master.outputs.network.conventions import MasterTimes
 from master.outputs.web.listening import is_loopback, is_open
+from master.outputs.worker import Worker
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,33 +32,20 @@ class Output:
     make: Callable[[OutputSettings, MasterTimes], Sink]
 
 
-def _osc(settings: OutputSettings, times: MasterTimes) -> Sink:
-    from master.outputs.network.osc import OscSink
+def _sink(name: str, kind: str) -> Callable[[OutputSettings, MasterTimes], Sink]:
+    """Maker of the sink `kind` in module `name`, of the settings of that name."""
 
-    return OscSink(settings.osc, times)
+    def make(settings: OutputSettings, times: MasterTimes) -> Sink:
+        module = import_module(f"master.outputs.network.{name}")
+        return getattr(module, kind)(getattr(settings, name), times)
 
-
-def _vmc(settings: OutputSettings, times: MasterTimes) -> Sink:
-    from master.outputs.network.vmc import VmcSink
-
-    return VmcSink(settings.vmc, times)
-
-
-def _lsl(settings: OutputSettings, times: MasterTimes) -> Sink:
-    from master.outputs.network.lsl import LslSink
-
-    return LslSink(settings.lsl, times)
-
-
-def _ros2(settings: OutputSettings, times: MasterTimes) -> Sink:
-    from master.outputs.network.ros2 import Ros2Sink
-
-    return Ros2Sink(settings.ros2, times)
+    return make
 
 
 def _web(settings: OutputSettings, times: MasterTimes) -> Sink:
     from master.outputs.web.server import WebSink
 
+    del times  # a page shows what is newest
     return WebSink(settings.web)
 
 
@@ -69,17 +55,31 @@ def _where_web(settings: OutputSettings) -> str:
     return address_of(settings.web, os.environ)
 
 
-EVERYTHING: tuple[type[ResultMessage], ...] = (HandPose, ObjectPose, Contact, Gesture)
 OUTPUTS: dict[str, Output] = {
-    "osc": Output(EVERYTHING, lambda s: s.osc, lambda s: f"udp {s.osc.host}:{s.osc.port}", _osc),
-    "vmc": Output((HandPose,), lambda s: s.vmc, lambda s: f"udp {s.vmc.host}:{s.vmc.port}", _vmc),
+    "osc": Output(
+        (HandPose, ObjectPose, Contact, Gesture),
+        lambda s: s.osc,
+        lambda s: f"udp {s.osc.host}:{s.osc.port}",
+        _sink("osc", "OscSink"),
+    ),
+    "vmc": Output(
+        (HandPose,),
+        lambda s: s.vmc,
+        lambda s: f"udp {s.vmc.host}:{s.vmc.port}",
+        _sink("vmc", "VmcSink"),
+    ),
     "ros2": Output(
         (HandPose, ObjectPose),
         lambda s: s.ros2,
         lambda s: f"router {s.ros2.router}, domain {s.ros2.domain_id}",
-        _ros2,
+        _sink("ros2", "Ros2Sink"),
     ),
-    "lsl": Output((HandPose,), lambda s: s.lsl, lambda s: f"streams {s.lsl.name}-HAND ({s.lsl.scope})", _lsl),
+    "lsl": Output(
+        (HandPose,),
+        lambda s: s.lsl,
+        lambda s: f"streams {s.lsl.name}-HAND ({s.lsl.scope})",
+        _sink("lsl", "LslSink"),
+    ),
     "web": Output((HandPose, ObjectPose), lambda s: s.web, _where_web, _web),
 }
 
@@ -117,37 +117,28 @@ DEPTH = 64  # messages; what a receiver was too slow for is old by then
 FIRST_RETRY_S = 1.0
 
 
+@dataclass(slots=True)
 class Counters:
     """Counts of one output since the process began, also while it is switched off."""
 
-    def __init__(self) -> None:
-        self.sent = 0  # messages that it took
-        self.failed = 0  # times it could not be opened, or broke on a message
-        self.dropped = 0  # messages that it was too slow for, or that came while it was not open
-        self.trouble = ""  # why it is not open; empty while nothing is wrong
+    sent: int = 0  # messages that it took
+    failed: int = 0  # times it could not be opened, or broke on a message
+    dropped: int = 0  # messages that it was too slow for, or that came while it was not open
+    trouble: str = ""  # why it is not open; empty while nothing is wrong
 
 
 class OutputLine:
-    """Feeds one `Sink` on a thread of its own from a queue that drops its oldest."""
+    """Feeds one `Sink` by a `Worker`, and opens it again on failure."""
 
     def __init__(
-        self,
-        name: str,
-        make: Callable[[], Sink],
-        counters: Counters,
-        notify: Callable[[str], None],
-        clock: Clock | None = None,
+        self, name: str, make: Callable[[], Sink], counters: Counters, notify: Callable[[str], None]
     ) -> None:
-        """Start at once; `make` opens the sink on the line's thread, again on failure."""
+        """Start at once; `make` opens the sink on the worker's thread."""
         self._name, self._make, self._counters, self._notify = name, make, counters, notify
-        self._clock: Clock = SystemClock() if clock is None else clock
-        self._queue: deque[ResultMessage] = deque()
-        self._changed = threading.Condition()
-        self._closing = False
         self._sink: Sink | None = None
-        self._wait_s = FIRST_RETRY_S
-        self._thread = threading.Thread(target=self._work, name=f"output {name}", daemon=True)
-        self._thread.start()
+        self._retry_s = FIRST_RETRY_S
+        self._worker = Worker[ResultMessage](f"output {name}", self._work, DEPTH, loses_oldest=True)
+        self._worker.start()
 
     @property
     def open(self) -> bool:
@@ -157,93 +148,60 @@ class OutputLine:
     @property
     def waiting(self) -> int:
         """Messages in its queue."""
-        return len(self._queue)
+        return self._worker.waiting
 
     def offer(self, message: ResultMessage) -> None:
         """Queue one message without waiting; the oldest makes room, or it is lost."""
-        with self._changed:
-            if self._sink is None:
-                self._counters.dropped += 1
-                return
-            if len(self._queue) >= DEPTH:
-                self._queue.popleft()
-                self._counters.dropped += 1
-            self._queue.append(message)
-            self._changed.notify()
+        lost = message if self._sink is None else self._worker.offer(message)
+        self._counters.dropped += lost is not None
 
     def close(self) -> None:
         """Send what waits, close the sink and end the thread. Safe to call twice."""
-        with self._changed:
-            self._closing = True
-            self._changed.notify()
         join_s = 3.0  # an output that hangs is left to the end of the process
-        self._thread.join(join_s)
-        if self._thread.is_alive():
+        if not self._worker.close(join_s):
             self._notify(f"{self._name}: hangs and was left behind")
 
     def _work(self) -> None:
         try:
-            while not self._closing or (self._sink is not None and self._queue):
-                if self._sink is None:
-                    self._open()
-                if self._sink is None:
-                    self._pause()
-                else:
-                    self._send()
+            while not self._worker.closing or (self._sink is not None and self._worker.waiting):
+                try:
+                    if self._sink is None:
+                        self._open()
+                    elif (message := self._worker.take()) is not None:
+                        self._sink.write(message)
+                        self._counters.sent += 1
+                except (PhalanxError, OSError) as error:
+                    self._failed(error)
         finally:  # also after an error that nobody foresaw: what has no thread any more is not open
             self._shut()
 
     def _open(self) -> None:
-        try:
-            self._sink = self._make()
-        except (PhalanxError, OSError) as error:
-            self._failed(error)
-            return
+        self._sink = self._make()
         if self._counters.trouble:
             self._notify(f"{self._name}: open again")
-        self._counters.trouble, self._wait_s = "", FIRST_RETRY_S
-
-    def _pause(self) -> None:
-        """Wait until the next retry."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._closing, self._wait_s)
-        last_retry_s = 10.0
-        self._wait_s = min(2.0 * self._wait_s, last_retry_s)
-
-    def _send(self) -> None:
-        """Hand on what waits, or wait for more."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._queue or self._closing)
-            messages = list(self._queue)
-            self._queue.clear()
-        sink = self._sink
-        for number, message in enumerate(messages):
-            assert sink is not None  # set and cleared by this thread alone
-            try:
-                sink.write(message)
-            except (PhalanxError, OSError) as error:
-                self._counters.dropped += len(messages) - number
-                self._shut()
-                self._failed(error)
-                return
-            self._counters.sent += 1
-
-    def _shut(self) -> None:
-        sink, self._sink = self._sink, None
-        if sink is None:
-            return
-        with self._changed:
-            self._counters.dropped += len(self._queue)
-            self._queue.clear()
-        try:
-            sink.close()
-        except (PhalanxError, OSError) as error:
-            self._notify(f"{self._name}: closing: {error}")
+        self._counters.trouble, self._retry_s = "", FIRST_RETRY_S
 
     def _failed(self, error: Exception) -> None:
-        """Count a failure, and report it once."""
+        """Count a failure, report it once, and open the output again."""
+        broke = self._sink is not None
+        self._counters.dropped += broke  # the message that it broke on
+        self._shut()
         self._counters.failed += 1
         text = str(error)
         if text != self._counters.trouble:
             self._notify(f"{self._name}: {text}; tried again")
         self._counters.trouble = text
+        if not broke:
+            last_retry_s = 10.0
+            self._worker.rest(self._retry_s)
+            self._retry_s = min(2.0 * self._retry_s, last_retry_s)
+
+    def _shut(self) -> None:
+        sink, self._sink = self._sink, None
+        self._counters.dropped += len(self._worker.clear())
+        if sink is None:
+            return
+        try:
+            sink.close()
+        except (PhalanxError, OSError) as error:
+            self._notify(f"{self._name}: closing: {error}")

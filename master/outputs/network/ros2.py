@@ -100,58 +100,6 @@ def _plain(name: str) -> str:
 
 
 _LOG = logging.getLogger(__name__)
-_RETRY = {"period_init_ms": 500, "period_max_ms": 2000, "period_increase_factor": 2}
-
-
-class RosPublishers:
-    """A ROS 2 node and its publishers."""
-
-    def __init__(self, router: str, domain: int, namespace: str, name: str) -> None:
-        """Join the router, like tcp/127.0.0.1:7447; BusError: malformed endpoint."""
-        timeout_ms = 1000
-        settings: dict[str, object] = {
-            "mode": "client",
-            "connect": {
-                "endpoints": [router],
-                "timeout_ms": timeout_ms,
-                "exit_on_failure": True,
-                "retry": _RETRY,
-            },
-            "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        }
-        try:
-            self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
-        except zenoh.ZError as error:
-            raise BusError(
-                f"ros2: no router at {router}: start one with `ros2 run rmw_zenoh_cpp rmw_zenohd`, or set `router`"
-            ) from error
-        self._node = Node(domain, str(self._session.info.zid()), namespace, name)
-        self._token = self._session.liveliness().declare_token(self._node.token())
-        self._publishers: dict[str, _Publisher] = {}
-
-    @property
-    def joined(self) -> bool:
-        """Whether a router is there now."""
-        return len(self._session.info.routers_zid()) > 0
-
-    def publish(self, topic: Topic, payload: bytes | memoryview) -> None:
-        """Send CDR with its header; the first declares the topic; BusError: session gone."""
-        try:
-            publisher = self._publishers.get(topic.name)
-            if publisher is None:
-                token = self._node.publisher_token(len(self._publishers) + 1, topic)
-                publisher = _Publisher(self._session, topic.key(self._node.domain), token)
-                self._publishers[topic.name] = publisher
-            publisher.put(payload)
-        except zenoh.ZError as error:
-            raise BusError(f"ros2: cannot publish {topic.name}: {error}") from error
-
-    def close(self) -> None:
-        """Leave: all tokens go. Safe to call twice."""
-        try:
-            self._session.close()
-        except zenoh.ZError as error:
-            _LOG.warning("ros2: closing: %s", error)
 
 
 class _Publisher:
@@ -161,7 +109,7 @@ class _Publisher:
         self._gid = gid_of(token)
         self._sent = 0
 
-    def put(self, payload: bytes | memoryview) -> None:
+    def put(self, payload: memoryview) -> None:
         self._sent += 1
         self._publisher.put(bytes(payload), attachment=attachment(self._sent, time.time_ns(), self._gid))
 
@@ -202,25 +150,18 @@ def hand_messages(pose: HandPose, wall_ns: int) -> list[tuple[Topic, memoryview]
     flags = np.where(pose.tracked & valid, 2, np.where(valid, 1, 0)).astype(np.uint8)
     layout = _TYPES["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
     out = [
-        _cdr(f"/phalanx/{hand}/joint_flags", FLAGS, _TYPES[FLAGS](layout=layout, data=flags)),
-        _cdr(f"/phalanx/{hand}/joint_states", STATES, _states(pose, header)),
+        _cdr(f"/phalanx/{hand}/joint_flags", FLAGS, layout=layout, data=flags),
+        _cdr(f"/phalanx/{hand}/joint_states", STATES, **_states(pose, header)),
     ]
     if valid.all():
-        poses = [_pose(places[j], quaternions[j]) for j in range(len(JOINTS))]
-        out.append(_cdr(f"/phalanx/{hand}/joint_poses", POSES, _TYPES[POSES](header=header, poses=poses)))
-    frames = [
-        _TYPES["geometry_msgs/msg/TransformStamped"](
-            header=header,
-            child_frame_id=f"{hand}/{JOINTS[j]}",
-            transform=_TYPES["geometry_msgs/msg/Transform"](
-                translation=_TYPES["geometry_msgs/msg/Vector3"](*places[j]),
-                rotation=_TYPES["geometry_msgs/msg/Quaternion"](*quaternions[j]),
-            ),
-        )
-        for j in np.flatnonzero(valid).tolist()
-    ]
-    if frames:
-        out.append(_cdr("/tf", TRANSFORMS, _TYPES[TRANSFORMS](transforms=frames)))
+        poses = [_pose(*pair) for pair in zip(places, quaternions, strict=True)]
+        out.append(_cdr(f"/phalanx/{hand}/joint_poses", POSES, header=header, poses=poses))
+    if valid.any():
+        frames = [
+            _frame(header, f"{hand}/{JOINTS[j]}", places[j], quaternions[j])
+            for j in np.flatnonzero(valid).tolist()
+        ]
+        out.append(_cdr("/tf", TRANSFORMS, transforms=frames))
     return out
 
 
@@ -230,35 +171,30 @@ def object_messages(pose: ObjectPose, wall_ns: int) -> list[tuple[Topic, memoryv
         return []
     name, header = ros_name(pose.object), _header(wall_ns)
     place, quaternion = pose.position_m.tolist(), pose.orientation_wxyz[[1, 2, 3, 0]].tolist()
-    covariance: Float = np.ascontiguousarray(pose.cov).ravel()
-    if not np.isfinite(covariance).all():
-        covariance = np.zeros(36)  # ROS: all zero is "not known"
-    encoded = _TYPES[POSE](
-        header=header,
-        pose=_TYPES["geometry_msgs/msg/PoseWithCovariance"](
-            pose=_pose(place, quaternion), covariance=covariance
-        ),
+    # ROS: all zero is "not known"
+    covariance: Float = pose.cov.ravel() if np.isfinite(pose.cov).all() else np.zeros(36)
+    full = _TYPES["geometry_msgs/msg/PoseWithCovariance"](
+        pose=_pose(place, quaternion), covariance=np.ascontiguousarray(covariance)
     )
-    frame = _TYPES["geometry_msgs/msg/TransformStamped"](
-        header=header,
-        child_frame_id=f"object/{name}",
-        transform=_TYPES["geometry_msgs/msg/Transform"](
-            translation=_TYPES["geometry_msgs/msg/Vector3"](*place),
-            rotation=_TYPES["geometry_msgs/msg/Quaternion"](*quaternion),
-        ),
-    )
+    frame = _frame(header, f"object/{name}", place, quaternion)
     return [
-        _cdr(f"/phalanx/object/{name}/pose", POSE, encoded),
-        _cdr("/tf", TRANSFORMS, _TYPES[TRANSFORMS](transforms=[frame])),
+        _cdr(f"/phalanx/object/{name}/pose", POSE, header=header, pose=full),
+        _cdr("/tf", TRANSFORMS, transforms=[frame]),
     ]
 
 
-def _states(pose: HandPose, header: object) -> object:
+def _states(pose: HandPose, header: object) -> dict[str, object]:
     angles = pose.angles_rad.ravel()
     known = np.flatnonzero(np.isfinite(angles))
     names = [f"{ros_name(pose.hand)}/{ANGLES[k]}" for k in known.tolist()]
     nothing = np.empty(0)
-    return _TYPES[STATES](header=header, name=names, position=angles[known], velocity=nothing, effort=nothing)
+    return {
+        "header": header,
+        "name": names,
+        "position": angles[known],
+        "velocity": nothing,
+        "effort": nothing,
+    }
 
 
 def _header(wall_ns: int) -> object:
@@ -275,21 +211,52 @@ def _pose(place: list[float], quaternion: list[float]) -> object:
     )
 
 
-def _cdr(name: str, type_name: str, message: object) -> tuple[Topic, memoryview]:
+def _frame(header: object, child: str, place: list[float], quaternion: list[float]) -> object:
+    return _TYPES["geometry_msgs/msg/TransformStamped"](
+        header=header,
+        child_frame_id=child,
+        transform=_TYPES["geometry_msgs/msg/Transform"](
+            translation=_TYPES["geometry_msgs/msg/Vector3"](*place),
+            rotation=_TYPES["geometry_msgs/msg/Quaternion"](*quaternion),
+        ),
+    )
+
+
+def _cdr(name: str, type_name: str, /, **fields: object) -> tuple[Topic, memoryview]:
+    message = _TYPES[type_name](**fields)
     return topic(name, type_name), _STORE.serialize_cdr(message, type_name, little_endian=True)
 
 
 class Ros2Sink:
-    """A `Sink`: the node `phalanx` in ROS's network."""
+    """A `Sink`: the node `phalanx` in ROS's network, and its publishers."""
 
     def __init__(self, settings: Ros2Output, times: MasterTimes) -> None:
-        """Join the router; BusError: the endpoint is malformed."""
+        """Join the router, like tcp/127.0.0.1:7447; BusError: none is there."""
         self._times, self._router = times, settings.router
-        self._publishers = RosPublishers(settings.router, settings.domain_id, "/", "phalanx")
+        config = {
+            "mode": "client",
+            "connect": {
+                "endpoints": [settings.router],
+                "timeout_ms": 1000,
+                "exit_on_failure": True,
+                "retry": {"period_init_ms": 500, "period_max_ms": 2000, "period_increase_factor": 2},
+            },
+            "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        }
+        try:
+            self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+        except zenoh.ZError as error:
+            raise BusError(
+                f"ros2: no router at {settings.router}: start one with `ros2 run rmw_zenoh_cpp rmw_zenohd`, or set"
+                " `router`"
+            ) from error
+        self._node = Node(settings.domain_id, str(self._session.info.zid()), "/", "phalanx")
+        self._token = self._session.liveliness().declare_token(self._node.token())
+        self._publishers: dict[str, _Publisher] = {}
 
     def write(self, message: ResultMessage) -> None:
         """Publish a hand or an object; BusError: the router is gone."""
-        if not self._publishers.joined:
+        if not self._session.info.routers_zid():
             raise BusError(f"ros2: the router at {self._router} is gone")
         if isinstance(message, HandPose):
             messages = hand_messages(message, self._times.wall_ns(message.t_ns))
@@ -298,8 +265,23 @@ class Ros2Sink:
         else:
             return
         for topic, payload in messages:
-            self._publishers.publish(topic, payload)
+            try:
+                self._publisher(topic).put(payload)
+            except zenoh.ZError as error:
+                raise BusError(f"ros2: cannot publish {topic.name}: {error}") from error
 
     def close(self) -> None:
-        """Leave ROS's network. Safe to call twice."""
-        self._publishers.close()
+        """Leave ROS's network: all tokens go. Safe to call twice."""
+        try:
+            self._session.close()
+        except zenoh.ZError as error:
+            _LOG.warning("ros2: closing: %s", error)
+
+    def _publisher(self, topic: Topic) -> _Publisher:
+        """That of a topic, which its first message declares."""
+        publisher = self._publishers.get(topic.name)
+        if publisher is None:
+            token = self._node.publisher_token(len(self._publishers) + 1, topic)
+            publisher = _Publisher(self._session, topic.key(self._node.domain), token)
+            self._publishers[topic.name] = publisher
+        return publisher

@@ -8,21 +8,22 @@ import secrets
 import threading
 from argparse import Namespace
 from collections.abc import Callable, Collection
+from contextlib import closing, suppress
+from functools import partial
 from pathlib import Path
 
 import msgspec
 from msgspec import Struct
 
 from common.bus.bus import Bus, Subscription
-from common.bus.zenoh_bus import ZenohBus
 from common.calibration import load
 from common.calibration.files import MonitoredFiles
 from common.calibration.output_settings import OutputSettings, default_outputs
-from common.clock import Clock, SystemClock
+from common.clock import now_ns
 from common.command_line import echo
 from common.errors import BusError, PhalanxError
 from common.machine import program
-from common.messages import Command, Health, Message, ResultMessage
+from common.messages import Command, Health, ResultMessage
 from common.messages.streams import MASTER
 from master.outputs.network.conventions import MasterTimes
 from master.outputs.network.outputs import OUTPUTS, Counters, OutputLine, switched_on, who_reads
@@ -53,12 +54,10 @@ class Sender:
         settings: OutputSettings,
         only: Collection[str],
         notify: Callable[[str], None],
-        clock: Clock | None = None,
     ) -> None:
         """Switch on what the settings have on, or exactly what `only` names."""
         refuse_unknown(only)
         self._settings, self._notify = settings, notify
-        self._clock: Clock = SystemClock() if clock is None else clock
         self._only = frozenset(only)
         self._session = secrets.randbits(63)
         self.times = MasterTimes()
@@ -88,16 +87,14 @@ class Sender:
     def switch(self, name: str, *, on: bool) -> None:
         """Switch one output; PhalanxError: there is no such output."""
         refuse_unknown([name])
+        line: OutputLine | None = None
         with self._lock:
-            line = self._lines.pop(name, None)
-            if on and line is not None:
-                self._lines[name] = line
-            elif on:
-                make, settings = OUTPUTS[name].make, self._settings
-                self._lines[name] = OutputLine(
-                    name, lambda: make(settings, self.times), self.counters_by_name[name], self._notify
-                )
-        if line is not None and not on:
+            if not on:
+                line = self._lines.pop(name, None)
+            elif name not in self._lines:
+                make = partial(OUTPUTS[name].make, self._settings, self.times)
+                self._lines[name] = OutputLine(name, make, self.counters_by_name[name], self._notify)
+        if line is not None:
             line.close()
             self.counters_by_name[name].trouble = ""
 
@@ -138,7 +135,7 @@ class Sender:
                 counts[f"dropped.{name}"] = counters.dropped
                 metrics[f"on.{name}"] = float(line is not None)
                 metrics[f"open.{name}"] = float(line is not None and line.open)
-        return Health(NAME, self._session, self._clock.now_ns(), counts, metrics, *program())
+        return Health(NAME, self._session, now_ns(), counts, metrics, *program())
 
     def obey(self, command: Command) -> None:
         """Obey a command, except `stop`; PhalanxError lists what there is."""
@@ -169,7 +166,6 @@ class Housekeeping:
         self._sender, self._bus, self._path, self._subscribers = sender, bus, path, subscribers
         self._monitored = MonitoredFiles()
         self._monitored.changed([path])  # as it was read
-        self._clock = SystemClock()
 
     def step(self, notify: Callable[[str], None]) -> None:
         """Use the file if it changed, ask the master for its time, publish the report."""
@@ -178,20 +174,15 @@ class Housekeeping:
                 self._sender.use(settings_of(self._path))
             except PhalanxError as error:
                 notify(f"{error}; the settings stay as they were")
-        self._echo()
+        asked_ns = now_ns()
+        with suppress(BusError):  # no master now: nothing comes from it either
+            master_ns = self._bus.ask(Command(MASTER, "report"), 0.5).t_ns
+            self._sender.times.push(asked_ns, master_ns, now_ns())
         self._bus.publish("health", NAME, self.health())
 
     def health(self) -> Health:
         """The report, with what was lost on the way here."""
         return self._sender.health(sum(subscriber.dropped for subscriber in self._subscribers))
-
-    def _echo(self) -> None:
-        asked_ns = self._clock.now_ns()
-        try:
-            master_ns = self._bus.ask(Command(MASTER, "report"), 0.5).t_ns
-        except BusError:
-            return  # no master now: nothing comes from it either
-        self._sender.times.push(asked_ns, master_ns, self._clock.now_ns())
 
 
 def run_sender(
@@ -219,51 +210,34 @@ def run_sender(
             stop.set()
         return housekeeping.health()
 
+    def report() -> None:
+        with suppress(BusError):  # closing
+            while not stop.wait(1.0):
+                housekeeping.step(notify)
+
     bus.serve(NAME, obey)
     bus.announce(NAME)
     for name in sender.on:
         notify(f"{name}: {sender.where(name)}")
     if not sender.on:
         notify(f"all outputs are off; switch them on in {path}, or name them: --only osc,vmc")
-    thread = threading.Thread(
-        target=lambda: _report_until(housekeeping, stop, notify), name="outputs report", daemon=True
-    )
+    thread = threading.Thread(target=report, name="outputs report", daemon=True)
     thread.start()
     try:
         while not stop.is_set():
-            _drain(subscribers, sender)
+            wait_s = 0.02  # for a hand, with which all else comes
+            for subscriber in subscribers:
+                while (message := subscriber.get(wait_s)) is not None:
+                    wait_s = 0.0
+                    if isinstance(message, ResultMessage):
+                        sender.push(message)
+                wait_s = 0.0
     finally:
         stop.set()
         thread.join(2.0)
         sender.close()
         for subscriber in subscribers:
             subscriber.close()
-
-
-def _report_until(housekeeping: Housekeeping, stop: threading.Event, notify: Callable[[str], None]) -> None:
-    while not stop.wait(1.0):
-        try:
-            housekeeping.step(notify)
-        except BusError:
-            return  # closing
-
-
-def _drain(subscribers: list[Subscription], sender: Sender) -> None:
-    """Forward what waits; else wait for a hand, with which all else comes."""
-    hands, *others = subscribers
-    poll_s = 0.02
-    message = hands.get(poll_s)
-    while message is not None:
-        _push(sender, message)
-        message = hands.get(0.0)
-    for subscriber in others:
-        while (message := subscriber.get(0.0)) is not None:
-            _push(sender, message)
-
-
-def _push(sender: Sender, message: Message) -> None:
-    if isinstance(message, ResultMessage):
-        sender.push(message)
 
 
 def refuse_unknown(names: Collection[str]) -> None:
@@ -280,29 +254,22 @@ def send(options: Namespace) -> None:
     """
     path = options.calibration / "outputs" / f"{options.outputs}.json"
     settings = settings_of(path)
-    names = [] if options.only is None else [name.strip() for name in options.only.split(",") if name.strip()]
+    names = [name.strip() for name in (options.only or "").split(",") if name.strip()]
     refuse_unknown(names)  # now, not when a master is there
+
+    def notify(line: str) -> None:
+        echo(f"outputs: {line}")
+
     stop = stop_on_signals()
     connection = bus_of_master(
-        options.bus, stop, lambda error: _print(f"waiting for a master: {error}"), options.site
+        options.bus, stop, lambda error: notify(f"waiting for a master: {error}"), options.site
     )
     if connection is None:
         return
-    try:
-        _refuse_second(connection)
-        run_sender(connection, settings, path, names, stop, _print)
-    finally:
-        connection.close()
-
-
-def _refuse_second(connection: ZenohBus) -> None:
-    """BusError if one runs: two would send everything and answer commands twice."""
-    if NAME in connection.alive():
-        raise BusError(
-            f"{NAME!r} is on the bus already: another `phalanx send` runs beside this master;"
-            " switch its outputs in its settings file, or end it"
-        )
-
-
-def _print(line: str) -> None:
-    echo(f"outputs: {line}")
+    with closing(connection):
+        if NAME in connection.alive():  # two would send everything and answer commands twice
+            raise BusError(
+                f"{NAME!r} is on the bus already: another `phalanx send` runs beside this master;"
+                " switch its outputs in its settings file, or end it"
+            )
+        run_sender(connection, settings, path, names, stop, notify)

@@ -88,8 +88,10 @@ class BoneMap:
         """For one side; `R_avatar_rig` (3, 3): rig axes -> avatar axes."""
         self._rest = t_pose(side)
         self._R_avatar_rig = R_avatar_rig
-        before = _left(matrix_to_quaternion(R_avatar_rig))
-        after = [_right(q) for q in matrix_to_quaternion(self._rest.swapaxes(1, 2))]
+        # matrices that multiply a quaternion from the left, and from the right
+        q, rests = matrix_to_quaternion(R_avatar_rig), matrix_to_quaternion(self._rest.swapaxes(1, 2))
+        before = np.stack([product(q, one) for one in np.eye(4)], axis=-1)
+        after = [np.stack([product(one, rest) for one in np.eye(4)], axis=-1) for rest in rests]
         self._to_bone = np.stack([before @ one for one in after])  # (16, 4, 4): orientation wxyz -> G
 
     def bones(self, pose: HandPose) -> Bones:
@@ -116,16 +118,6 @@ class BoneMap:
 def mirrored_xyzw(q_wxyz: Float) -> Float:
     """Quaternions (..., 4) wxyz of the avatar frame as Unity's, xyzw."""
     return q_wxyz[..., [1, 2, 3, 0]] * [-1.0, -1.0, 1.0, 1.0]
-
-
-def _left(q_wxyz: Float) -> Float:
-    """Matrix (4, 4) that multiplies a quaternion by this one (4,) from the left."""
-    return np.stack([product(q_wxyz, unit) for unit in np.eye(4)], axis=-1)
-
-
-def _right(q_wxyz: Float) -> Float:
-    """Matrix (4, 4) that multiplies a quaternion by this one (4,) from the right."""
-    return np.stack([product(unit, q_wxyz) for unit in np.eye(4)], axis=-1)
 
 
 def product(a_wxyz: Float, b_wxyz: Float) -> Float:

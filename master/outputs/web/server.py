@@ -111,14 +111,17 @@ class WebServer:
         self._files = _files()
         self._clients, self._request_filter = clients, request_filter or RequestFilter()
         self._mailboxes: dict[ServerConnection, Mailbox] = {}
-        self._names = _own_names(host)
+        names = machine_names() | {host.lower()}
+        self._names = frozenset(name for name in names if name and not _is_address(name))
         self._lock = threading.Lock()
         self._newest: dict[str, bytes] = {}
         self._skipped = 0
         self._socket = _listening(host, port)
         self._loop = asyncio.new_event_loop()
         self._stopping = asyncio.Event()
-        self._thread = threading.Thread(target=self._run, name="web", daemon=True)
+        self._thread = threading.Thread(
+            target=lambda: self._loop.run_until_complete(self._serve()), name="web", daemon=True
+        )
         self._thread.start()
 
     @property
@@ -162,9 +165,6 @@ class WebServer:
         if not self._thread.is_alive():
             self._socket.close()
             self._loop.close()
-
-    def _run(self) -> None:
-        self._loop.run_until_complete(self._serve())
 
     async def _serve(self) -> None:
         quiet = logging.getLogger(f"{__name__}.connections")
@@ -228,7 +228,11 @@ class WebServer:
             kind, body = self._files[path]
             answer = _response(HTTPStatus.OK, kind, body)
             if self._request_filter.key is not None:
-                answer.headers["Set-Cookie"] = self._cookie(self._request_filter.key)
+                cookie_s = 30 * 24 * 3600
+                answer.headers["Set-Cookie"] = (
+                    f"{self._name()}={self._request_filter.key}; Path=/; Max-Age={cookie_s}; HttpOnly; SameSite=Strict"
+                    f"{'' if self._request_filter.tls is None else '; Secure'}"
+                )
             return answer
         if path != PATH:
             return _refusal(HTTPStatus.NOT_FOUND, f"{path}: there are {', '.join([*self._files, PATH])}")
@@ -249,11 +253,6 @@ class WebServer:
 
     def _name(self) -> str:
         return f"phalanx-hands-{self.port}"  # cookies know no port
-
-    def _cookie(self, key: str) -> str:
-        secure = "; Secure" if self._request_filter.tls is not None else ""
-        cookie_s = 30 * 24 * 3600
-        return f"{self._name()}={key}; Path=/; Max-Age={cookie_s}; HttpOnly; SameSite=Strict{secure}"
 
 
 async def _send(connection: ServerConnection, mailbox: Mailbox) -> None:
@@ -286,10 +285,6 @@ def _is_address(name: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _own_names(host: str) -> frozenset[str]:
-    return frozenset(name for name in machine_names() | {host.lower()} if name and not _is_address(name))
 
 
 def _listening(host: str, port: int) -> socket.socket:

@@ -11,7 +11,7 @@ as well; they hold its whole offset from its parent, in place of OFFSET, as read
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Literal
 
@@ -20,7 +20,7 @@ import numpy as np
 from common.arrays import Float
 from common.calibration.files import replacing
 from common.geometry.transforms import quaternion_to_matrix
-from common.hand.model import WRIST
+from common.hand.model import JOINTS, WRIST
 from master.recording.export.motion import (
     CHILDREN,
     ORDER,
@@ -28,7 +28,6 @@ from master.recording.export.motion import (
     Motion,
     Skeleton,
     back,
-    name_of,
     rotate,
     times,
 )
@@ -39,7 +38,6 @@ PER_METRE: dict[Unit, float] = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 
 RIGID_M = 1e-5
 _ROWS = 256
-_HALF_ROTATION_ABOUT_X = np.array([0.0, 1.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,12 +57,11 @@ def upright(motion: Motion, up: Up) -> Motion:
     """A motion in the rig frame, in that of the file."""
     if up == "rig":
         return motion
-    return Motion(
-        motion.t_ns,
-        motion.position_m * np.array([1.0, -1.0, -1.0]),
-        times(_HALF_ROTATION_ABOUT_X, motion.orientation_wxyz),
-        motion.held,
-        motion.gap_ns,
+    half_turn_about_x = np.array([0.0, 1.0, 0.0, 0.0])
+    return replace(
+        motion,
+        position_m=motion.position_m * np.array([1.0, -1.0, -1.0]),
+        orientation_wxyz=times(half_turn_about_x, motion.orientation_wxyz),
     )
 
 
@@ -126,7 +123,7 @@ def _hierarchy(
     moves = joint == WRIST or joint in free
     channels = ["Xposition", "Yposition", "Zposition"] if moves else []
     channels += ["Zrotation", "Xrotation", "Yrotation"]
-    lines = [f"{tab}{'JOINT' if depth else 'ROOT'} {name_of(joint)}", f"{tab}{{"]
+    lines = [f"{tab}{'JOINT' if depth else 'ROOT'} {JOINTS[joint]}", f"{tab}{{"]
     lines += [
         f"{inner}OFFSET {_numbers(rest[joint])}",
         f"{inner}CHANNELS {len(channels)} {' '.join(channels)}",

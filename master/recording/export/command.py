@@ -9,8 +9,6 @@ from common.errors import PhalanxError
 from master.commands.summary import write_summary
 from master.recording.lines import ProgressLine, bar
 
-_MOTION = ("bvh", "gltf")
-
 
 def export(options: Namespace) -> None:
     """Export recorded hands for other tools.
@@ -18,45 +16,42 @@ def export(options: Namespace) -> None:
     The formats are tables, motion capture, an animated model and Rerun.
     """
     if options.compare is not None:
-        for given, option in (
-            (options.to, "--to"),
-            (options.out, "--out"),
-            (options.hand, "--hand"),
-            (options.up, "--up"),
-        ):
-            _refuse(bool(given), option, "exporting", f"--compare {options.compare}")
-        from master.mocap.read import Reading
-        from master.recording.export import truth
-        from master.recording.export.take import Window
-
-        wanted = truth.Wanted(
-            Reading(options.joints, options.unit, options.side, options.rate),
-            tuple(options.only or ()),
-            Window(options.from_s, options.to_s),
-            options.aligned,
-            options.calibration,
-            tuple(options.rig or ()),
-        )
-        found = truth.compare_source(
-            options.source, options.compare, wanted, lambda line: echo(f"compare: {line}")
-        )
-        if options.json_file is not None:
-            write_summary(options.json_file, found)
-        return
-    if options.to is None:
+        _compare(options, f"--compare {options.compare}")
+    elif options.to is not None:
+        _convert(options, f"--to {options.to}")
+    else:
         raise PhalanxError("give --to FORMAT to export, or --compare FILE to hold the poses against it")
-    for given, option in (
-        (options.joints, "--joints"),
-        (options.side, "--side"),
-        (options.aligned, "--aligned"),
-        (options.json_file, "--json"),
-    ):
-        _refuse(bool(given), option, "--compare", f"--to {options.to}")
-    to, this = options.to, f"--to {options.to}"
-    _refuse(to not in _MOTION and options.rate is not None, "--rate", "bvh and gltf", this)
-    _refuse(to not in _MOTION and options.up is not None, "--up", "bvh and gltf", this)
-    _refuse(to != "bvh" and options.unit is not None, "--unit", "bvh", this)
-    _refuse(to != "rrd" and bool(options.rig), "--rig", "rrd", this)
+
+
+def _compare(options: Namespace, this: str) -> None:
+    _refuse(options, "to out hand up", "exporting", this)
+    from master.mocap.read import Reading
+    from master.recording.export.take import Window
+    from master.recording.export.truth import compare_source
+
+    found = compare_source(
+        options.source,
+        options.compare,
+        Reading(options.joints, options.unit, options.side, options.rate),
+        Window(options.from_s, options.to_s),
+        lambda line: echo(f"compare: {line}"),
+        hands=options.only,
+        aligned=options.aligned,
+        calibration=options.calibration,
+        rigs=options.rig,
+    )
+    if options.json_file is not None:
+        write_summary(options.json_file, found)
+
+
+def _convert(options: Namespace, this: str) -> None:
+    _refuse(options, "joints side aligned json_file", "--compare", this)
+    if options.to not in ("bvh", "gltf"):
+        _refuse(options, "rate up", "bvh and gltf", this)
+    if options.to != "bvh":
+        _refuse(options, "unit", "bvh", this)
+    if options.to != "rrd":
+        _refuse(options, "rig", "rrd", this)
     # Imported here: what writes these formats takes a second to load, which no other command should wait for.
     from master.recording.export.bvh import Axes
     from master.recording.export.run import Wanted
@@ -66,10 +61,10 @@ def export(options: Namespace) -> None:
     wanted = Wanted(
         options.to,
         options.out,
-        tuple(options.only or ()),
-        tuple(options.hand or ()),
+        tuple(options.only),
+        tuple(options.hand),
         options.calibration,
-        tuple(options.rig or ()),
+        tuple(options.rig),
         Window(options.from_s, options.to_s),
         options.rate,
         Axes(options.unit or "cm", options.up or "y"),
@@ -78,9 +73,12 @@ def export(options: Namespace) -> None:
     export_source(options.source, wanted, progress.notify, progress.update)
 
 
-def _refuse(wrong: bool, option: str, purpose: str, this: str) -> None:
-    if wrong:
-        raise PhalanxError(f"{option} is for {purpose}, and this is {this}")
+def _refuse(options: Namespace, names: str, purpose: str, this: str) -> None:
+    """PhalanxError where one of these options is given."""
+    for name in names.split():
+        if getattr(options, name):
+            option = name.removesuffix("_file")
+            raise PhalanxError(f"--{option} is for {purpose}, and this is {this}")
 
 
 class _Progress:

@@ -10,7 +10,7 @@ its two joints; over the wrist and neighbouring metacarpals; and the ball of the
 and a sphere moves with one joint, so that nothing opens where a joint bends.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
@@ -27,14 +27,9 @@ from common.hand.model import FINGER_JOINTS, JOINTS, WRIST
 from master.recording.export.bvh import RIGID_M, Up, upright
 from master.recording.export.motion import (
     CHILDREN,
-    PARENT,
     Motion,
     Skeleton,
-    back,
     local,
-    name_of,
-    rotate,
-    times,
 )
 
 _ROUND = 140  # points of a sphere
@@ -194,9 +189,14 @@ def write_gltf(path: Path, motion: Motion, skeleton: Skeleton, up: Up) -> tuple[
     Raises:
         OSError: It cannot be written; nothing half written is left.
     """
-    data = _Data(
-        gl.GLTF2(asset=gl.Asset(version="2.0", generator="Phalanx", extras=_about(motion, skeleton, up)))
-    )
+    about = {
+        "hand": skeleton.hand,
+        "side": skeleton.side,
+        "up": up,
+        "first_t_ns": str(int(motion.t_ns[0])),  # more digits than a number of JSON has everywhere
+        "held_keys": motion.held_frames,
+    }
+    data = _Data(gl.GLTF2(asset=gl.Asset(version="2.0", generator="Phalanx", extras=about)))
     _nodes(data, skeleton)
     _skin(data, skeleton, skin_of(skeleton))
     free = _animation(data, local(with_holds(upright(motion, up))), skeleton)
@@ -211,16 +211,6 @@ def write_gltf(path: Path, motion: Motion, skeleton: Skeleton, up: Up) -> tuple[
     return free
 
 
-def _about(motion: Motion, skeleton: Skeleton, up: Up) -> dict[str, object]:
-    return {
-        "hand": skeleton.hand,
-        "side": skeleton.side,
-        "up": up,
-        "first_t_ns": str(int(motion.t_ns[0])),  # more digits than a number of JSON has everywhere
-        "held_keys": motion.held_frames,
-    }
-
-
 def with_holds(motion: Motion) -> Motion:
     """Add a key just before the end of every gap: the hand as at its beginning."""
     gaps = np.flatnonzero(np.diff(motion.t_ns) > motion.gap_ns)
@@ -230,18 +220,22 @@ def with_holds(motion: Motion) -> Motion:
     after = motion.t_ns[np.minimum(rows + 1, len(motion) - 1)]
     hold_s = 1e-3  # before the end of a gap the hand still stands where it was
     t_ns[second] = after[second] - round(hold_s * 1e9)
-    return Motion(
-        t_ns, motion.position_m[rows], motion.orientation_wxyz[rows], motion.held[rows], motion.gap_ns
+    return replace(
+        motion,
+        t_ns=t_ns,
+        position_m=motion.position_m[rows],
+        orientation_wxyz=motion.orientation_wxyz[rows],
+        held=motion.held[rows],
     )
 
 
 def _nodes(data: _Data, skeleton: Skeleton) -> None:
     """Nodes 0 ... 25 are the joints, 26 is the mesh, 27 holds the joints."""
-    at, q = _rest(skeleton)
+    at, q = skeleton.local()
     for joint in range(len(JOINTS)):
         data.gltf.nodes.append(
             gl.Node(
-                name=name_of(joint),
+                name=JOINTS[joint],
                 translation=at[joint].tolist(),
                 rotation=_xyzw(q[joint]).tolist(),
                 children=list(CHILDREN[joint]),
@@ -253,16 +247,6 @@ def _nodes(data: _Data, skeleton: Skeleton) -> None:
     # a skinned mesh goes by its joints, not by a parent
     data.gltf.scenes.append(gl.Scene(nodes=[whole, mesh]))
     data.gltf.scene = 0
-
-
-def _rest(skeleton: Skeleton) -> tuple[Float, Float]:
-    """Joints at rest to their parent, the wrist to the palm: (26, 3) [m], (26, 4)."""
-    at, q = skeleton.position_m.copy(), skeleton.orientation_wxyz.copy()
-    for joint, parent in PARENT.items():
-        there = back(skeleton.orientation_wxyz[parent])
-        at[joint] = rotate(there, skeleton.position_m[joint] - skeleton.position_m[parent])
-        q[joint] = times(there, skeleton.orientation_wxyz[joint])
-    return at, q
 
 
 def _xyzw(q_wxyz: Float) -> Float:
@@ -307,7 +291,7 @@ def _skin(data: _Data, skeleton: Skeleton, skin: Skin) -> None:
 
 def _animation(data: _Data, own: Motion, skeleton: Skeleton) -> tuple[int, ...]:
     """Keys of all that moves; what stands still is set in its node."""
-    at, q = _rest(skeleton)
+    at, q = skeleton.local()
     times_s = ((own.t_ns - own.t_ns[0]) * 1e-9).astype("<f4")
     clip = gl.Animation(name=skeleton.hand)
     keys = data.add(times_s.reshape(-1, 1), bounds=True)

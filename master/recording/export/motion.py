@@ -12,7 +12,7 @@ places in the rig frame. Over a gap in time nothing is interpolated: the hand st
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import cast
 
@@ -21,7 +21,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.errors import RecordingError
 from common.geometry.transforms import matrix_to_quaternion
-from common.hand.model import FINGER_JOINTS, JOINTS, PALM, WRIST, HandModel
+from common.hand.model import FINGER_JOINTS, PALM, WRIST, HandModel
 from master.outputs.poses import Poses
 
 PARENT: dict[int, int] = {PALM: WRIST} | {
@@ -54,14 +54,18 @@ class Skeleton:
             radius_m=model.radius_m,
         )
 
+    def local(self) -> tuple[Float, Float]:
+        """Each joint in its parent's frame, the wrist in the palm's: (26, 3), (26, 4)."""
+        at, q = self.position_m.copy(), self.orientation_wxyz.copy()
+        for joint, parent in PARENT.items():
+            there = back(self.orientation_wxyz[parent])
+            at[joint] = rotate(there, self.position_m[joint] - self.position_m[parent])
+            q[joint] = times(there, self.orientation_wxyz[joint])
+        return at, q
+
     def ahead_m(self, joint: int) -> Float:
         """From a joint to the end of its flesh along its -z (3,) [m], palm frame."""
         return self.radius_m[joint] * rotate(self.orientation_wxyz[joint], np.array([0.0, 0.0, -1.0]))
-
-
-def name_of(joint: int) -> str:
-    """The joint as XR_EXT_hand_tracking calls it, in the spelling of WebXR."""
-    return JOINTS[joint]
 
 
 def times(a_wxyz: Float, b_wxyz: Float) -> Float:
@@ -180,10 +184,8 @@ def _held(
     parent = PARENT[joint]
     both = usable[:, joint] & usable[:, parent]
     if not both.any():
-        q = back(skeleton.orientation_wxyz[parent])
-        at = rotate(q, skeleton.position_m[joint] - skeleton.position_m[parent])
-        shape = (len(usable), 1)
-        return np.tile(at, shape), np.tile(times(q, skeleton.orientation_wxyz[joint]), shape)
+        at, q = (np.tile(rest[joint], (len(usable), 1)) for rest in skeleton.local())
+        return at, q
     row = _last(both)
     q = back(orientation[row, parent])
     return rotate(q, position[row, joint] - position[row, parent]), times(q, orientation[row, joint])
@@ -199,7 +201,7 @@ def local(motion: Motion) -> Motion:
     flips = np.vecdot(orientation[1:], orientation[:-1]) < 0.0
     sign = np.where(np.cumsum(flips, axis=0) % 2 == 1, -1.0, 1.0)
     orientation[1:] *= sign[..., None]
-    return Motion(motion.t_ns, position, orientation, motion.held, motion.gap_ns)
+    return replace(motion, position_m=position, orientation_wxyz=orientation)
 
 
 def world(motion: Motion) -> Motion:
@@ -208,7 +210,7 @@ def world(motion: Motion) -> Motion:
     for joint, parent in PARENT.items():
         position[:, joint] = position[:, parent] + rotate(orientation[:, parent], position[:, joint])
         orientation[:, joint] = times(orientation[:, parent], orientation[:, joint])
-    return Motion(motion.t_ns, position, orientation, motion.held, motion.gap_ns)
+    return replace(motion, position_m=position, orientation_wxyz=orientation)
 
 
 def resample(motion: Motion, rate_hz: float) -> Motion:
@@ -236,15 +238,11 @@ def resample(motion: Motion, rate_hz: float) -> Motion:
     gap = (span > motion.gap_ns) & (share > 0.0) & (share < 1.0)
     share = np.where(gap, 0.0, share)[:, None]
     own = local(motion)
-    position = _between(own.position_m, before, after, share)
+    first = own.position_m[before]
+    position = first + share[..., None] * (own.position_m[after] - first)
     orientation = slerp(own.orientation_wxyz[before], own.orientation_wxyz[after], share)
     held = motion.held[before] | (motion.held[after] & (share > 0.0)) | gap[:, None]
     return world(Motion(t_ns, position, orientation, held, motion.gap_ns))
-
-
-def _between(values: Float, before: Int, after: Int, share: Float) -> Float:
-    first = values[before]
-    return first + share[..., None] * (values[after] - first)
 
 
 def slerp(first: Float, second: Float, share: Float) -> Float:

@@ -1,22 +1,21 @@
 """Export of a source: which files are written, and the messages to the user."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from common.calibration import HandProfile, load
 from common.errors import CalibrationError, PhalanxError, RecordingError
-from common.hand.model import HandModel
-from master.outputs.poses import Poses, record
+from common.hand.model import JOINTS, HandModel
+from common.messages import Detections, ResultMessage
+from master.outputs.poses import Poses
+from master.outputs.rerun import write_rrd
 from master.outputs.result_files import cannot_write
 from master.recording.export.bvh import Axes, write_bvh
 from master.recording.export.gltf import write_gltf
-from master.recording.export.motion import Motion, Skeleton, complete, name_of, resample
-from master.recording.export.rrd import setup_of, write_take
+from master.recording.export.motion import Motion, Skeleton, complete, resample
 from master.recording.export.table import (
     Column,
     TableKind,
@@ -27,6 +26,7 @@ from master.recording.export.table import (
     write_table,
 )
 from master.recording.export.take import Take, Window, open_take
+from master.rig.setup import RigSetup, load_setups
 
 Kind = Literal["csv", "parquet", "bvh", "gltf", "rrd"]
 SUFFIXES: dict[Kind, tuple[str, ...]] = {
@@ -154,7 +154,12 @@ def _tables(
 
     for hand in hands:
         batches = (hand_columns(one, begin) for one in _counted(take, hand, progress))
-        write(_of_hand(target, hands, hand), f"hand {hand}", hand_columns(_no_poses(hand), begin), batches)
+        write(
+            _of_hand(target, hands, hand),
+            f"hand {hand}",
+            hand_columns(Poses.stacked((), hand=hand), begin),
+            batches,
+        )
     for thing in take.objects():
         _refuse_path(thing.object, target)
         columns = object_columns(thing, begin)
@@ -169,13 +174,6 @@ def _tables(
         columns = gesture_columns(gestures, begin)
         write(_sibling(target, "gestures"), "gestures", columns, [columns])
     return tuple(written)
-
-
-def _no_poses(hand: str) -> Poses:
-    """A table without rows."""
-    dtype = record(0)
-    arrays = {name: np.empty((0, *dtype[name].shape), dtype[name].base) for name in dtype.names or ()}
-    return Poses(hand=hand, **arrays)
 
 
 def _counted(take: Take, hand: str, progress: ProgressCallback) -> Iterator[Poses]:
@@ -233,12 +231,9 @@ def _motion(
     if held := motion.held_frames:
         text += f"; in {held} of them something was not observed and stands still"
     if free:
-        text += f"; {_named(free)} moved on {'its' if len(free) == 1 else 'their'} bone and has position keys"
+        named = JOINTS[free[0]] if len(free) == 1 else f"{len(free)} joints"
+        text += f"; {named} moved on {'its' if len(free) == 1 else 'their'} bone and has position keys"
     return text
-
-
-def _named(joints: tuple[int, ...]) -> str:
-    return name_of(joints[0]) if len(joints) == 1 else f"{len(joints)} joints"
 
 
 def skeleton_of(hand: str, tree: Path, profiles: tuple[Path, ...]) -> Skeleton:
@@ -287,8 +282,62 @@ def _viewed(
                 notify(f"hand {hand}: no poses: no file of it")
                 continue
             path = _of_hand(target, hands, hand)
-            setup = setup_of(hand, tree, rigs, wanted.profiles)
-            write_take(path, take, poses, setup, partial(progress, path.name))
+            setup = _setup_of(hand, tree, rigs, wanted.profiles)
+            _write_rrd(path, take, poses, setup, partial(progress, path.name))
             notify(f"wrote {path}: hand {hand}, {sum(map(len, poses))} poses (open with: rerun {path})")
             written.append(path)
     return tuple(written)
+
+
+def _setup_of(hand: str, tree: Path, rigs: Sequence[str], profiles: Sequence[Path]) -> RigSetup:
+    """Return the setup that watched a hand, of several rigs in a calibration tree.
+
+    `profiles`: a file of the hand in place of that which the rigs name; at most one.
+
+    Raises:
+        CalibrationError: A file is missing or broken, or none of the rigs watches this hand.
+        PhalanxError: Several profiles.
+    """
+    if len(profiles) > 1:
+        raise PhalanxError("--to rrd takes one --hand FILE at most: the hands are those that the rigs name")
+    setups = load_setups(tree, rigs, next(iter(profiles), None))
+    for setup in setups:
+        if setup.hand.profile.name == hand:
+            return setup
+    known = ", ".join(setup.hand.profile.name for setup in setups)
+    raise CalibrationError(f"rig {', '.join(rigs)}: watches {known}, the poses are of {hand!r}: give --rig")
+
+
+def _write_rrd(
+    path: Path, take: Take, batches: Sequence[Poses], setup: RigSetup, progress: Callable[[int, int], None]
+) -> None:
+    """Write the poses of a hand, one batch or more, with what else was recorded.
+
+    Raises:
+        RecordingError: The file cannot be written, or the poses are not of one marker count.
+    """
+    counts = {one.marker_count for one in batches}
+    if len(counts) > 1:
+        raise RecordingError(
+            f"hand {batches[0].hand!r}: its number of markers changes, {sorted(counts)}: export one part of it, with"
+            " --from and --until"
+        )
+    poses = Poses.joined(batches)
+    cameras = {
+        name: [setup.own(frame) for frame in frames]
+        for name, frames in take.detections().items()
+        if name in setup.camera_names
+    }
+    seen: dict[str, list[Detections]] = {name: frames for name, frames in cameras.items() if frames}
+    write_rrd(path, poses, setup, detections=seen, results=_results(take, poses.hand), progress=progress)
+
+
+def _results(take: Take, hand: str) -> list[ResultMessage]:
+    """Objects, contact and gestures of this hand, each in the order of time."""
+    out: list[ResultMessage] = [one for one in take.gestures() if one.hand == hand]
+    for poses in take.objects():
+        out += poses.messages()
+    for near in take.contacts():
+        if near.hand == hand:
+            out += near.messages()
+    return out

@@ -6,10 +6,10 @@ Both are read in batches, so that an hour fits.
 import tempfile
 from collections.abc import Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 
@@ -25,18 +25,11 @@ from common.messages import (
     WristDetections,
 )
 from common.recording.messages import MessageRecording, open_messages
-from master.outputs.poses import Poses, load_poses, path_of_hand
-from master.outputs.result_files import (
-    GESTURES,
-    Contacts,
-    ObjectPoses,
-    load_contact,
-    load_gesture_messages,
-    load_object,
-)
+from master.outputs.poses import Poses, path_of_hand
+from master.outputs.result_files import GESTURES, Contacts, ObjectPoses, load_gesture_messages
 from master.recording.files import recorded_rigs, unpack
 
-_Table = TypeVar("_Table", Poses, ObjectPoses, Contacts)
+TableT = TypeVar("TableT", Poses, ObjectPoses, Contacts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,17 +65,10 @@ class Window:
             good &= t_ns <= last
         return good
 
-    def of(self, table: _Table, begin_t_ns: int) -> _Table:
+    def of(self, table: TableT, begin_t_ns: int) -> TableT:
         """The rows of a table that are in it."""
         good = self.inside(table.t_ns, begin_t_ns)
-        if good.all():
-            return table
-        arrays: dict[str, Any] = {
-            one.name: getattr(table, one.name)[good]
-            for one in fields(table)
-            if one.name not in ("hand", "object")
-        }
-        return replace(table, **arrays)
+        return table if good.all() else table.where(good)
 
 
 _Kind = TypeVar("_Kind", HandPose, ObjectPose, Contact, Gesture, MarkerDetections, WristDetections)
@@ -97,14 +83,10 @@ class _RunTake:
 
     def __init__(self, path: Path, window: Window) -> None:
         self._folder, self._window = path.parent, window
-        first = load_poses(path)
-        siblings = {
-            file: load_poses(file) for file in sorted(path.parent.glob(f"{path.stem}-*{path.suffix}"))
-        }
-        hands = [
-            first,
-            *(poses for file, poses in siblings.items() if file == path_of_hand(path, poses.hand)),
-        ]
+        first = Poses.load(path)
+        files = sorted(path.parent.glob(f"{path.stem}-*{path.suffix}"))
+        siblings = {file: Poses.load(file) for file in files}
+        hands = [first, *(one for file, one in siblings.items() if file == path_of_hand(path, one.hand))]
         self.begin_t_ns = min((int(poses.t_ns[0]) for poses in hands if len(poses)), default=0)
         self._poses = {poses.hand: window.of(poses, self.begin_t_ns) for poses in hands}
 
@@ -121,11 +103,13 @@ class _RunTake:
             yield poses.rows(start, min(start + _BATCH, len(poses)))
 
     def objects(self) -> list[ObjectPoses]:
-        found = [load_object(path) for path in sorted(self._folder.glob("object_*.npz"))]
-        return [self._window.of(one, self.begin_t_ns) for one in found]
+        return self._tables(ObjectPoses, "object_*.npz")
 
     def contacts(self) -> list[Contacts]:
-        found = [load_contact(path) for path in sorted(self._folder.glob("contact_*.npz"))]
+        return self._tables(Contacts, "contact_*.npz")
+
+    def _tables(self, kind: type[TableT], pattern: str) -> list[TableT]:
+        found = [kind.load(path) for path in sorted(self._folder.glob(pattern))]
         return [self._window.of(one, self.begin_t_ns) for one in found]
 
     def gestures(self) -> list[Gesture]:
@@ -182,13 +166,13 @@ class _MessageTake:
         found: dict[str, list[ObjectPose]] = {}
         for one in self._read("object", ObjectPose):
             found.setdefault(one.object, []).append(one)
-        return [ObjectPoses.of(name, rows) for name, rows in found.items()]
+        return [ObjectPoses.stacked(rows, object=name) for name, rows in found.items()]
 
     def contacts(self) -> list[Contacts]:
         found: dict[tuple[str, str], list[Contact]] = {}
         for one in self._read("contact", Contact):
             found.setdefault((one.hand, one.object), []).append(one)
-        return [Contacts.of(hand, name, rows) for (hand, name), rows in found.items()]
+        return [Contacts.stacked(rows, hand=hand, object=name) for (hand, name), rows in found.items()]
 
     def gestures(self) -> list[Gesture]:
         return list(self._read("gesture", Gesture))

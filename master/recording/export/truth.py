@@ -1,7 +1,6 @@
 """`phalanx export SOURCE --compare FILE`: poses against motion capture."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,43 +18,43 @@ from master.recording.export.take import Take, Window, open_take
 _SIX = MARKERS[:6]  # the order of a rig's markers, where nothing else is stated
 
 
-@dataclass(frozen=True, slots=True)
-class Wanted:
-    """What is to be compared, and how."""
-
-    reading: Reading  # how the motion capture is to be read
-    hands: tuple[str, ...] = ()  # name of the hand; none: the only one of the source
-    window: Window = field(default_factory=Window)
-    # the file has the rig's frame, and the clock of the poses or seconds from their beginning
-    aligned: bool = False
-    calibration: Path = Path("calib_json")  # tree with rigs
-    rigs: tuple[str, ...] = ()  # name of the rig whose markers the poses have; none: the default six
-
-
 def compare_source(
-    source: Path, truth: Path, wanted: Wanted, notify: Callable[[str], None]
+    source: Path,
+    truth: Path,
+    reading: Reading,
+    window: Window,
+    notify: Callable[[str], None],
+    *,
+    hands: Sequence[str] = (),
+    aligned: bool = False,
+    calibration: Path,
+    rigs: Sequence[str] = (),
 ) -> dict[str, object]:
     """Compare a source with a motion capture; return all figures, for a program.
 
     Args:
         source: poses.npz of a run, or an .mcap recording.
         truth: The motion capture.
+        reading: How that is to be read.
         notify: Called with a line at a time.
+        hands: Name of the hand; none: the only one of the source.
+        aligned: The file has the rig's frame, and the clock of the poses or seconds from their beginning.
+        calibration: Tree with rigs.
+        rigs: Name of the rig whose markers the poses have; none: the default six.
 
     Raises:
         RecordingError: The source or the motion capture cannot be read, or have no time or point in common.
         CalibrationError: The rig, or the file of names, is missing or broken.
         FitError: They cannot be brought together.
     """
-    aligned = wanted.aligned
-    take = open_take(source, wanted.window)
+    take = open_take(source, window)
     for remark in take.remarks:
         notify(remark)
-    poses = _poses(take, wanted.hands, source)
-    motion = read_motion(truth, wanted.reading)
+    poses = _poses(take, hands, source)
+    motion = read_motion(truth, reading)
     for remark in motion.remarks:
         notify(remark)
-    names = _marker_names(poses, wanted)
+    names = _marker_names(poses, calibration, rigs)
     ours, theirs = _common(poses, motion, names)
     if aligned:
         alignment, how = _own_clock(take.begin_t_ns, poses, motion)
@@ -76,7 +75,7 @@ def compare_source(
     return {"truth": str(truth), "hand": poses.hand, "alignment": fitted, **found}
 
 
-def _poses(take: Take, hands: tuple[str, ...], source: Path) -> Poses:
+def _poses(take: Take, hands: Sequence[str], source: Path) -> Poses:
     """All poses of one hand; RecordingError: several and none is named, or none."""
     there = ", ".join(take.hands) or "no hand"
     named = [hand for hand in take.hands if not hands or hand in hands]
@@ -86,20 +85,19 @@ def _poses(take: Take, hands: tuple[str, ...], source: Path) -> Poses:
     batches = [batch for batch in take.batches(name) if len(batch)]
     if not batches:
         raise RecordingError(f"{source}: holds no poses of {name}, nothing to compare")
-    count = batches[0].marker_count
-    if any(batch.marker_count != count for batch in batches):
+    if len({batch.marker_count for batch in batches}) > 1:
         raise RecordingError(f"{source}: its poses change their markers: compare a part, --from and --until")
     return Poses.joined(batches)
 
 
-def _marker_names(poses: Poses, wanted: Wanted) -> tuple[str, ...]:
+def _marker_names(poses: Poses, calibration: Path, rigs: Sequence[str]) -> tuple[str, ...]:
     """The markers of poses, in their order; none where it is not known."""
-    if not wanted.rigs:
+    if not rigs:
         return _SIX if poses.marker_count == len(_SIX) else ()
-    rig, *others = wanted.rigs
+    rig, *others = rigs
     if others:
         raise PhalanxError("--compare: one --rig, whose markers the poses have")
-    names = load(wanted.calibration / "rigs" / f"{rig}.json", RigCalibration).markers
+    names = load(calibration / "rigs" / f"{rig}.json", RigCalibration).markers
     if len(names) != poses.marker_count:
         raise PhalanxError(f"--rig {rig}: has {len(names)} markers, the poses {poses.marker_count}")
     return names

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import pytest
 
-from common.bus.bus import MOST_SENDERS, Bus, Inbox, LoopbackBus
+from common.bus.bus import MOST_SENDERS, Bus, Inbox
 from common.bus.zenoh_bus import ZenohBus
 from common.errors import BusError
 from common.messages import Command, Health, encode
+from tests.memory_bus import LoopbackBus
 from tests.network_helpers import free_endpoint, health, until
 
 

@@ -4,21 +4,26 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.hand.skin import TaperedCapsules, gaps_between
+from common.geometry.tapered_capsules import Capsules
+from common.hand.skin import gaps_between
 
 
-def _capsules(rng: np.random.Generator, count: int) -> TaperedCapsules:
+def _cones(start: Float, along: Float, radius_m: Float, growth_m: Float) -> Capsules:
+    return Capsules(start, start + along, radius_m, radius_m + growth_m)
+
+
+def _capsules(rng: np.random.Generator, count: int) -> Capsules:
     along = rng.normal(size=(count, 3))
     along *= rng.uniform(0.015, 0.04, (count, 1)) / np.linalg.norm(along, axis=1, keepdims=True)
     start = rng.normal(0.0, 0.04, (count, 3))
-    return TaperedCapsules(start, along, rng.uniform(0.006, 0.009, count), rng.uniform(-0.002, 0.001, count))
+    return _cones(start, along, rng.uniform(0.006, 0.009, count), rng.uniform(-0.002, 0.001, count))
 
 
-def _balls(capsules: TaperedCapsules, k: int) -> tuple[Float, Float]:
+def _balls(capsules: Capsules, k: int) -> tuple[Float, Float]:
     share = np.linspace(0.0, 1.0, 201)
     return (
-        capsules.start_m[k] + share[:, None] * capsules.along_m[k],
-        capsules.radius_m[k] + share * capsules.growth_m[k],
+        capsules.start_m[k] + share[:, None] * (capsules.stop_m[k] - capsules.start_m[k]),
+        capsules.start_radius_m[k] + share * (capsules.stop_radius_m[k] - capsules.start_radius_m[k]),
     )
 
 
@@ -35,18 +40,16 @@ def test_the_gap_is_that_of_the_nearest_two_balls() -> None:
 
 
 def test_golden_two_balls_and_two_rods() -> None:
-    ball = TaperedCapsules(np.zeros(3), np.array([1e-6, 0.0, 0.0]), np.array(0.010), np.array(0.0))
-    other = TaperedCapsules(
-        np.array([0.0, 0.03, 0.0]), np.array([1e-6, 0.0, 0.0]), np.array(0.008), np.array(0.0)
-    )
+    ball = _cones(np.zeros(3), np.array([1e-6, 0.0, 0.0]), np.array(0.010), np.array(0.0))
+    other = _cones(np.array([0.0, 0.03, 0.0]), np.array([1e-6, 0.0, 0.0]), np.array(0.008), np.array(0.0))
     found = gaps_between(ball, other)
     assert float(found.gap_m) == pytest.approx(0.012)  # 30 - 10 - 8
     np.testing.assert_allclose(found.middle_m, [0.0, 0.016, 0.0], atol=1e-5)  # 10 + 12 / 2
     np.testing.assert_allclose(found.a_to_b, [0.0, 1.0, 0.0], atol=1e-4)
-    crossed = TaperedCapsules(
+    crossed = _cones(
         np.array([0.01, 0.02, -0.01]), np.array([0.0, 0.0, 0.02]), np.array(0.005), np.array(0.0)
     )
-    rod = TaperedCapsules(np.zeros(3), np.array([0.02, 0.0, 0.0]), np.array(0.005), np.array(0.0))
+    rod = _cones(np.zeros(3), np.array([0.02, 0.0, 0.0]), np.array(0.005), np.array(0.0))
     assert float(gaps_between(rod, crossed).gap_m) == pytest.approx(0.010)  # two rods that cross 20 apart
 
 

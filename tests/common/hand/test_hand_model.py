@@ -330,10 +330,6 @@ def mounted(profile: HandProfile) -> HandProfile:
 BROKEN: dict[str, tuple[Callable[[HandProfile], HandProfile], tuple[str, ...]]] = {
     "missing joint": (without, ("rest_joints", "ring-finger-tip")),
     "unknown joint": (lambda p: with_joint(p, "elbow"), ("rest_joints", "elbow")),
-    "no quaternion": (
-        lambda p: with_joint(p, "wrist", orientation_wxyz=(0.5, 0.0, 0.0, 0.0)),
-        ("orientation_wxyz",),
-    ),
     "no bone": (
         lambda p: with_joint(p, "thumb-tip", position_m=p.rest_joints["thumb-phalanx-distal"].position_m),
         ("rest_joints", "1 mm"),

@@ -23,11 +23,8 @@ SIDES: dict[str, Callable[[RigCalibration, CameraCalibration], WristDevice]] = {
     "slave": lambda rig, camera: WristView.of(rig, camera, HAND),
     "master": lambda rig, camera: WristSetup.of(rig, camera, HandModel.of(HAND)),
 }
-SHRUNK = ((2.0, 0, 0, 0), (0, 1.0, 0, 0), (0, 0, 1.0, 0), (0, 0, 0, 1.0))
-MIRRORED = ((1.0, 0, 0, 0), (0, 1.0, 0, 0), (0, 0, -1.0, 0), (0, 0, 0, 1.0))
 FAR = ((1.0, 0, 0, 0), (0, 1.0, 0, 31.0), (0, 0, 1.0, 92.0), (0, 0, 0, 1.0))  # millimetres
 BEHIND = ((1.0, 0, 0, 0), (0, 1.0, 0, 0.09), (0, 0, 1.0, -0.3), (0, 0, 0, 1.0))
-PERSPECTIVE = ((1.0, 0, 0, 0), (0, 1.0, 0, 0), (0, 0, 1.0, 0), (0, 0, 0.1, 1.0))
 
 
 @pytest.mark.parametrize("side", SIDES)
@@ -38,9 +35,6 @@ PERSPECTIVE = ((1.0, 0, 0, 0), (0, 1.0, 0, 0), (0, 0, 1.0, 0), (0, 0, 0.1, 1.0))
         ({"cameras": ("other",)}, "cameras: other"),
         ({"laser_plane": None}, "laser_plane is missing, .*calibrate wrist laser-plane"),
         ({"T_camera_palm": None}, "T_camera_palm is missing, .*calibrate wrist palm"),
-        ({"T_camera_palm": SHRUNK}, "T_camera_palm: not a rotation"),
-        ({"T_camera_palm": MIRRORED}, "T_camera_palm: not a rotation"),
-        ({"T_camera_palm": PERSPECTIVE}, "T_camera_palm: not a rotation"),
         (
             {"laser_plane": LaserPlane(normal=(0.0, 1.0, 0.0), offset_m=0.0)},
             "laser_plane: .*must cross the fingers",

@@ -21,7 +21,7 @@ STEP_S = BOARD.held_s + BOARD.moved_s
 
 def seen_at(renderer: BoardRenderer, camera: str, t_s: float) -> tuple[Float, Float]:
     """Corners (54, 2) as found near the truth, and the truth [px]."""
-    truth = SCENE.optics(camera).project(transform(SCENE.T_rig_board(t_s), board_corners()))
+    truth = SCENE.optics[camera].project(transform(SCENE.T_rig_board(t_s), board_corners()))
     grey = np.asarray(cv2.cvtColor(renderer.render(t_s), cv2.COLOR_BGR2GRAY))
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-3)
     start = truth.astype(np.float32).reshape(-1, 1, 2)

@@ -28,7 +28,7 @@ def outline(camera: str, place: int) -> Float:
     low, high = np.full_like(SIDE, -0.5), np.full_like(SIDE, 0.5)
     x, y = np.concatenate([SIDE, high, -SIDE, low]), np.concatenate([low, SIDE, high, -SIDE])
     edge = np.stack([WIDTH_M * x, HEIGHT_M * y, np.zeros_like(x)], axis=1)
-    return SCENE.optics(camera).project(transform(SCENE.poses[place], edge))
+    return SCENE.optics[camera].project(transform(SCENE.poses[place], edge))
 
 
 def centroid(polygon: Float) -> Float:

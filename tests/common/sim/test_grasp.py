@@ -112,11 +112,11 @@ def test_both_cameras_lose_all_tips_while_it_is_held_and_never_the_back(side: st
     scene = scene_by_name("grasp", RIG, CAMERAS, HANDS[side], seed)
     for name in RIG.cameras:
         renderer = Renderer(scene, name)
-        shown = np.array([renderer.visible_fraction(t) for t in held_times(grasp(side, seed), 0.57)])
+        shown = np.array([renderer.markers(t).visible for t in held_times(grasp(side, seed), 0.57)])
         assert shown[:, :5].max() < 0.5
         assert (shown[:, :5] < 0.1).mean() > 0.8
         assert shown[:, 5].min() > 0.9
-        back = renderer.visible_fraction(TIMING.back_s)
+        back = renderer.markers(TIMING.back_s).visible
         assert back.min() > 0.9  # at rest all are seen again
 
 

@@ -72,21 +72,9 @@ def test_a_course_goes_straight_jumps_and_stays() -> None:
     assert schedule.at(2.999999).kelvin == pytest.approx(5000.0, abs=0.01)
 
 
-@pytest.mark.parametrize(
-    ("make", "expected"),
-    [
-        (lambda: planckian_xy(1000.0), "1000 K"),
-        (lambda: LightSchedule(()), "at least one"),
-        (lambda: LightSchedule(((2.0, 5000.0, 1.0), (1.0, 5000.0, 1.0))), "order of time"),
-        (lambda: LightSchedule(((0.0, 100.0, 1.0),)), "100 K"),
-        (lambda: LightSchedule(((0.0, 5000.0, 0.0),)), "exposure 0"),
-        (lambda: LightSchedule(((0.0, 5000.0, 1.0),), calibrated_kelvin=1700.0), "no blue"),
-    ],
-)
-def test_an_impossible_light_is_refused(make: object, expected: str) -> None:
-    assert callable(make)
-    with pytest.raises(PhalanxError, match=expected):
-        make()
+def test_an_impossible_light_is_refused() -> None:
+    with pytest.raises(PhalanxError, match="1000 K"):
+        planckian_xy(1000.0)
 
 
 def test_bytes_change_in_linear_light_and_clip() -> None:

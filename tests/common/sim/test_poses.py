@@ -88,7 +88,7 @@ def test_a_pointing_hand_hides_its_bent_fingers_from_the_first_pair_and_not_from
     poses = StudyPoses(HandModel.of(HANDS[side]), view_centre(RIG), 7)
     times = [(k + 0.8) * STATION_S for k, name in enumerate(poses.order) if name == "pointing"]
     shown = {
-        name: np.array([np.nan_to_num(Renderer(scene, name).visible_fraction(t)) for t in times])
+        name: np.array([np.nan_to_num(Renderer(scene, name).markers(t).visible) for t in times])
         for name in ("left", "left2")
     }
     assert (shown["left"][:, 1] > 0.9).all()  # the finger that points
@@ -128,7 +128,7 @@ def test_what_is_hidden_agrees_with_path_traced_hands(datasets: Path) -> None:
         fingers = row[5:].reshape(4, 4)
         angles[1:] = np.stack([fingers[:, 1] - fan, fingers[:, 0], fingers[:, 2], fingers[:, 3]], axis=1)
         scene = Scene.of_motion(rig, manifest.cameras, profile, _Still(HandState(palm, angles)))
-        seen.append(np.array([Renderer(scene, name).visible_fraction(0.0) for name in rig.cameras]))
+        seen.append(np.array([Renderer(scene, name).markers(0.0).visible for name in rig.cameras]))
     visible = np.nan_to_num(np.array(seen))
     assert (share < 0.5).sum() > 20  # of 72: the poses do hide tips
     assert ((visible >= 0.5) == (share >= 0.5)).mean() > 0.93
@@ -158,7 +158,7 @@ def test_from_behind_the_forearm_the_sleeve_hides_the_tips() -> None:
     for t in TIMES[::60]:
         snapshot = view.snapshot(float(t))
         assert not snapshot.into_sleeve
-        sleeve, shown = snapshot.points[list(SLEEVE_SPHERES)], renderer.visible_fraction(float(t))
+        sleeve, shown = snapshot.points[list(SLEEVE_SPHERES)], renderer.markers(float(t)).visible
         for tip in range(5):
             apart, along = nearest_to_ray(snapshot.points[view.cap_centre[tip]], sleeve)
             if apart < radius - view.cap_radius[tip] and along < 0.9:

@@ -64,7 +64,7 @@ def markers_of(scene: Scene, camera: str, t_s: float = 0.0) -> MarkerView:
     """What a camera sees of everything, without its picture."""
     view = View(scene, camera)
     painter, snapshot = Painter(view), view.snapshot(t_s)
-    return painter.truth(painter.cover(snapshot, view.cards(snapshot)))
+    return painter.truth(painter.cover(snapshot, view.cards(snapshot)), snapshot)
 
 
 MIDDLE = rigid(facing(0.3), np.array([0.03, 0.0, 0.5]))

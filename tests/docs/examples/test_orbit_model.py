@@ -14,10 +14,10 @@ import rerun as rr
 from msgspec.structs import replace
 
 from common.arrays import Float
-from common.bus.bus import LoopbackBus
 from common.messages import Gesture
 from common.messages.streams import MASTER
 from tests.docs.examples.loading import example, wait_for
+from tests.memory_bus import LoopbackBus
 
 STEP_NS = 16_666_667
 

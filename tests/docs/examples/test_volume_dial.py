@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from common.bus.bus import LoopbackBus
 from common.bus.zenoh_bus import ZenohBus
 from common.errors import PhalanxError
 from common.messages import Gesture
 from common.messages.streams import MASTER
 from tests.docs.examples.loading import example, wait_for
+from tests.memory_bus import LoopbackBus
 from tests.network_helpers import until
 
 STEP_NS = 16_666_667

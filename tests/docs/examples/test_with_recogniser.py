@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.bus.bus import LoopbackBus
 from common.calibration.gesture_settings import default_gestures
 from common.geometry.transforms import matrix_to_quaternion
 from common.hand.model import HandModel
@@ -20,6 +19,7 @@ from master.gestures.poses import GestureRecogniser
 from master.outputs.bus import BusSink
 from master.rig.setup import RigSetup, load_setup
 from tests.docs.examples.loading import example
+from tests.memory_bus import LoopbackBus
 
 HZ = 60.0
 START_NS = 10**9

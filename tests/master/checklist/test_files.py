@@ -41,45 +41,23 @@ def _plan(tree: Path) -> Plan:
     return plan_of(load_setups(tree, ("desk",)))
 
 
+LATER = {"intrinsics": _measured("2026-02-01")}
+# fmt: off
 CHANGES: list[tuple[str, str, str, Callable[[Path], None]]] = [
     ("calibration_absent", "left", "cannot be used", lambda tree: (tree / "cameras/left.json").unlink()),
     ("calibration_absent", "left", "cannot be used", lambda tree: _put(tree / "cameras/left.json", "{")),
-    (
-        "calibration_absent",
-        "left",
-        "lens is not measured",
-        lambda tree: _edit(tree / "cameras/left.json", lambda file: file | {"intrinsics": None}),
-    ),
-    (
-        "calibration_absent",
-        "desk",
-        "places",
-        lambda tree: _edit(tree / "rigs/desk.json", lambda rig: rig | {"T_rig_camera": {}}),
-    ),
-    (
-        "calibration_absent",
-        "default-right",
-        "hand",
-        lambda tree: (tree / "hands/default-right.json").unlink(),
-    ),
-    (
-        "calibration_stale",
-        "left",
-        "measured after",
-        lambda tree: _edit(
-            tree / "cameras/left.json",
-            lambda file: file | {"provenance": {"intrinsics": _measured("2026-02-01")}},
-        ),
-    ),
-    (
-        "calibration_stale",
-        "left",
-        "1280 x 960",
-        lambda tree: _edit(
-            tree / "cameras/left.json", lambda file: file | {"width_px": 1280, "height_px": 960}
-        ),
-    ),
+    ("calibration_absent", "left", "lens is not measured",
+     lambda tree: _edit(tree / "cameras/left.json", lambda file: file | {"intrinsics": None})),
+    ("calibration_absent", "desk", "places",
+     lambda tree: _edit(tree / "rigs/desk.json", lambda rig: rig | {"T_rig_camera": {}})),
+    ("calibration_absent", "default-right", "hand",
+     lambda tree: (tree / "hands/default-right.json").unlink()),
+    ("calibration_stale", "left", "measured after",
+     lambda tree: _edit(tree / "cameras/left.json", lambda file: file | {"provenance": LATER})),
+    ("calibration_stale", "left", "1280 x 960",
+     lambda tree: _edit(tree / "cameras/left.json", lambda file: file | {"width_px": 1280, "height_px": 960})),
 ]
+# fmt: on
 
 
 def _put(path: Path, text: str) -> None:

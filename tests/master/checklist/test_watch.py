@@ -27,12 +27,12 @@ class Case:
     fix: str
 
 
+def _metrics(name: str, metrics: dict[str, float]) -> Callable[[Bench], object]:
+    return lambda bench: bench.metrics.setdefault(name, {}).update(metrics)
+
+
 def _metric(name: str, **metrics: float) -> Callable[[Bench], object]:
-    return lambda bench: bench.metrics.setdefault(name, {}).update(metrics)
-
-
-def _named(name: str, metrics: dict[str, float]) -> Callable[[Bench], object]:
-    return lambda bench: bench.metrics.setdefault(name, {}).update(metrics)
+    return _metrics(name, metrics)
 
 
 def _event(name: str, event: str, per_s: float) -> Callable[[Bench], object]:
@@ -50,12 +50,8 @@ def _unseen(bench: Bench) -> None:
     _event("left", "seen.index", 0.0)(bench)
 
 
-def _apart(share: float) -> Callable[[Bench], object]:
-    return lambda bench: setattr(bench, "apart", share)
-
-
-def _disk(free_mb: float) -> Callable[[Bench], object]:
-    return lambda bench: setattr(bench, "disk_mb", free_mb)
+def _put(what: str, value: object) -> Callable[[Bench], object]:
+    return lambda bench: setattr(bench, what, value)
 
 
 def _stranger(bench: Bench) -> None:
@@ -85,201 +81,67 @@ def _as_ours(bench: Bench) -> None:
     bench.away.clear()
 
 
-def _files(*items: CheckItem) -> Callable[[Bench], object]:
-    return lambda bench: setattr(bench, "files", items)
-
-
 LENS = CheckItem(
     "calibration_absent", "left", "Camera left: its lens is not measured.", "calibrate cameras intrinsics"
 )
 OLD = CheckItem("calibration_stale", "left", "The lens of camera left was measured after.", "calibrate")
+# fmt: off
 CASES = [
-    Case(
-        "camera_absent",
-        "left",
-        lambda b: b.away.add("left"),
-        lambda b: b.away.clear(),
-        "not received any more",
-        "slave",
-    ),
-    Case(
-        "auto_mode",
-        "left",
-        _metric("left", exposure_us=7000.0),
-        _metric("left", exposure_us=5000.0),
-        "7000, not 5000",
-        "automatic",
-    ),
-    Case(
-        "exposure_drift",
-        "left",
-        _metric("left", light_exposure=0.5),
-        _metric("left", light_exposure=1.0),
-        "0.5 times",
-        "calibrate",
-    ),
-    Case(
-        "colour_collision",
-        "left.index-back",
-        _named("left", {"overlap.index..back": 3.0}),
-        lambda b: b.metrics["left"].clear(),
-        "index and back overlap by 3 hues",
-        "repaint",
-    ),
-    Case(
-        "colour_collision",
-        "left.index-ring",
-        _named("left", {"alike.index..ring": 4.0}),
-        lambda b: b.metrics["left"].clear(),
-        "look alike, 4 hues apart",
-        "repaint",
-    ),
-    Case(
-        "marker_unseen",
-        "left.index",
-        _unseen,
-        _event("left", "seen.index", 60.0),
-        "not once since its colours were changed",
-        "calibrate its colours",
-    ),
-    Case(
-        "background_in_range",
-        "left.back",
-        _event("left", "ambiguous.back", 60.0),
-        _event("left", "ambiguous.back", 0.0),
-        "colour of marker back",
-        "cover it",
-    ),
-    Case(
-        "calibration_absent", "left", _files(LENS), _files(), "not measured", "calibrate cameras intrinsics"
-    ),
-    Case(
-        "calibration_absent",
-        "left",
-        lambda b: b.counts.update(left={"uncalibrated": 1, "uncalibrated.ring": 1, "uncalibrated.back": 1}),
-        lambda b: b.counts.update(left={"uncalibrated": 0}),
-        "no colour for ring, back: it does not see them",
-        "phalanx-slave colours",
-    ),
-    Case("calibration_stale", "left", _files(OLD), _files(), "after", "calibrate"),
-    Case(
-        "calibration_stale",
-        "left",
-        _metric("left", width_px=1280.0),
-        _metric("left", width_px=640.0),
-        "1280 x 480",
-        "same cameras/left.json",
-    ),
-    Case(
-        "camera_moved", "left-right", _apart(0.8), _apart(0.0), "miss each other", "calibrate cameras stereo"
-    ),
-    Case(
-        "clock_unsynchronised",
-        "right",
-        _set("sigma_ns", "right", 4e6),
-        _set("sigma_ns", "right", 5e4),
-        "4.0 ms",
-        "cable",
-    ),
-    Case(
-        "clock_unsynchronised",
-        "right",
-        _set("sigma_ns", "right", None),
-        _set("sigma_ns", "right", 5e4),
-        "not known",
-        "cable",
-    ),
+    Case("camera_absent", "left", lambda b: b.away.add("left"), lambda b: b.away.clear(),
+         "not received any more", "slave"),
+    Case("auto_mode", "left", _metric("left", exposure_us=7000.0), _metric("left", exposure_us=5000.0),
+         "7000, not 5000", "automatic"),
+    Case("exposure_drift", "left", _metric("left", light_exposure=0.5), _metric("left", light_exposure=1.0),
+         "0.5 times", "calibrate"),
+    Case("colour_collision", "left.index-back", _metrics("left", {"overlap.index..back": 3.0}),
+         lambda b: b.metrics["left"].clear(), "index and back overlap by 3 hues", "repaint"),
+    Case("colour_collision", "left.index-ring", _metrics("left", {"alike.index..ring": 4.0}),
+         lambda b: b.metrics["left"].clear(), "look alike, 4 hues apart", "repaint"),
+    Case("marker_unseen", "left.index", _unseen, _event("left", "seen.index", 60.0),
+         "not once since its colours were changed", "calibrate its colours"),
+    Case("background_in_range", "left.back", _event("left", "ambiguous.back", 60.0),
+         _event("left", "ambiguous.back", 0.0), "colour of marker back", "cover it"),
+    Case("calibration_absent", "left", _put("files", (LENS,)), _put("files", ()), "not measured",
+         "calibrate cameras intrinsics"),
+    Case("calibration_absent", "left",
+         lambda b: b.counts.update(left={"uncalibrated": 1, "uncalibrated.ring": 1, "uncalibrated.back": 1}),
+         lambda b: b.counts.update(left={"uncalibrated": 0}),
+         "no colour for ring, back: it does not see them", "phalanx-slave colours"),
+    Case("calibration_stale", "left", _put("files", (OLD,)), _put("files", ()), "after", "calibrate"),
+    Case("calibration_stale", "left", _metric("left", width_px=1280.0), _metric("left", width_px=640.0),
+         "1280 x 480", "same cameras/left.json"),
+    Case("camera_moved", "left-right", _put("apart", 0.8), _put("apart", 0.0), "miss each other",
+         "calibrate cameras stereo"),
+    Case("clock_unsynchronised", "right", _set("sigma_ns", "right", 4e6), _set("sigma_ns", "right", 5e4),
+         "4.0 ms", "cable"),
+    Case("clock_unsynchronised", "right", _set("sigma_ns", "right", None), _set("sigma_ns", "right", 5e4),
+         "not known", "cable"),
     Case("packet_loss", "right", _set("loss", "right", 0.1), _set("loss", "right", 0.0), "10 %", "cable"),
-    Case(
-        "rate_low",
-        "left",
-        _set("rate", "left", 30.0),
-        _set("rate", "left", 60.0),
-        "30 frames",
-        "frame_rate_hz",
-    ),
-    Case(
-        "rate_low",
-        "wrist",
-        _set("rate", "wrist", 60.0),
-        _set("rate", "wrist", 90.0),
-        "60 frames",
-        "frame_rate_hz",
-    ),
-    Case(
-        "too_hot",
-        "left",
-        _metric("left", temperature_c=86.0),
-        _metric("left", temperature_c=50.0),
-        "86 °C",
-        "fan",
-    ),
-    Case(
-        "too_hot",
-        "imu",
-        _metric("imu", throttled=1.0),
-        _metric("imu", throttled=0.0),
-        "supply is too weak",
-        "supply",
-    ),
-    Case(
-        "disk_full",
-        "left",
-        _metric("left", disk_free_mb=60.0),
-        _metric("left", disk_free_mb=900.0),
-        "60 MB",
-        "recordings",
-    ),
-    Case("disk_full", "master", _disk(60.0), _disk(900.0), "60 MB", "recordings"),
-    Case(
-        "strobe_slipped",
-        "wrist",
-        _event("wrist", "strobe.out_of_step", 20.0),
-        _event("wrist", "strobe.out_of_step", 0.0),
-        "in the wrong frame",
-        "lead_us",
-    ),
-    Case(
-        "imu_silent",
-        "imu",
-        lambda b: b.away.add("imu"),
-        lambda b: b.away.clear(),
-        "not received any more",
-        "phalanx-slave run --name imu",
-    ),
-    Case(
-        "duplicate_sender",
-        "left",
-        _set("duplicate", "left", RejectedPeer("10.0.0.7", 10)),
-        _set("duplicate", "left", None),
-        "the one at 10.0.0.7 is ignored",
-        "--name",
-    ),
-    Case(
-        "version_mismatch",
-        "right",
-        _stranger,
-        _as_ours,
-        "right at 10.0.0.8 speaks wire version 9",
-        "Install the same version",
-    ),
-    Case(
-        "secret_mismatch",
-        "right",
-        _unproven,
-        _as_ours,
-        "10.0.0.9 claims to be right",
-        "device-right.secret",
-    ),
-    Case(
-        "marker_mismatch",
-        "left",
-        _other_rig,
-        _same_rig,
-        "left sends 8 markers, the rig of this master has 6",
-        "phalanx fleet deploy",
-    ),
+    Case("rate_low", "left", _set("rate", "left", 30.0), _set("rate", "left", 60.0), "30 frames",
+         "frame_rate_hz"),
+    Case("rate_low", "wrist", _set("rate", "wrist", 60.0), _set("rate", "wrist", 90.0), "60 frames",
+         "frame_rate_hz"),
+    Case("too_hot", "left", _metric("left", temperature_c=86.0), _metric("left", temperature_c=50.0), "86 °C",
+         "fan"),
+    Case("too_hot", "imu", _metric("imu", throttled=1.0), _metric("imu", throttled=0.0), "supply is too weak",
+         "supply"),
+    Case("disk_full", "left", _metric("left", disk_free_mb=60.0), _metric("left", disk_free_mb=900.0),
+         "60 MB", "recordings"),
+    Case("disk_full", "master", _put("disk_mb", 60.0), _put("disk_mb", 900.0), "60 MB", "recordings"),
+    Case("strobe_slipped", "wrist", _event("wrist", "strobe.out_of_step", 20.0),
+         _event("wrist", "strobe.out_of_step", 0.0), "in the wrong frame", "lead_us"),
+    Case("imu_silent", "imu", lambda b: b.away.add("imu"), lambda b: b.away.clear(), "not received any more",
+         "phalanx-slave run --name imu"),
+    Case("duplicate_sender", "left", _set("duplicate", "left", RejectedPeer("10.0.0.7", 10)),
+         _set("duplicate", "left", None), "the one at 10.0.0.7 is ignored", "--name"),
+    Case("version_mismatch", "right", _stranger, _as_ours, "right at 10.0.0.8 speaks wire version 9",
+         "Install the same version"),
+    Case("secret_mismatch", "right", _unproven, _as_ours, "10.0.0.9 claims to be right",
+         "device-right.secret"),
+    Case("marker_mismatch", "left", _other_rig, _same_rig,
+         "left sends 8 markers, the rig of this master has 6", "phalanx fleet deploy"),
 ]
+# fmt: on
 
 
 def test_every_code_has_a_case() -> None:
@@ -376,7 +238,7 @@ def test_causes_silence_what_follows_from_them_and_nothing_else() -> None:
     ]
 
 
-def test_of_three_cameras_the_one_that_moved_is_named() -> None:
+def test_of_three_cameras_the_one_that_moved_is_metrics() -> None:
     rule, verdicts = MovedRule(), list[Verdict]()
     for k in range(20):
         counts = {"poses": 15 * k, "mostly_rejected.top": 14 * k}

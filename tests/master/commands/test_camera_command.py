@@ -7,13 +7,14 @@ from typing import Any
 import msgspec
 import pytest
 
-from common.bus.bus import Bus, LoopbackBus
+from common.bus.bus import Bus
 from common.calibration import CameraCalibration, load
 from common.calibration.camera_settings import CameraSettings, ColourPick
 from common.errors import BusError, CalibrationError, CameraError, PhalanxError
 from common.messages import Command, Health
 from master.commands import camera
 from master.commands.camera import commands, send_all, settings, table
+from tests.memory_bus import LoopbackBus
 
 ROOT = Path(__file__).resolve().parents[3]
 LEFT = ROOT / "calib_json/cameras/left.json"

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from common.bus.bus import LoopbackBus
 from common.calibration import RigCalibration, load
 from common.clock import SystemClock
 from common.errors import BusError, PhalanxError
 from common.messages import Health
 from master.commands.fleet import Roll, at_master, expected_devices, here
 from slave.uplink import Uplink
+from tests.memory_bus import LoopbackBus
 from tests.network_helpers import detections, free_udp_port
 
 DESK = load(Path(__file__).parents[3] / "calib_json/rigs/desk.json", RigCalibration)

@@ -4,28 +4,21 @@ import json
 import socket
 from pathlib import Path
 
+import msgspec
 import pytest
 
-from common.bus.bus import LoopbackBus
-from common.calibration import CameraCalibration, RigCalibration, load, save
+from common.calibration import CameraCalibration, HsvRange, RigCalibration, load, save
 from common.calibration.output_settings import OutputSettings
 from common.errors import BusError, CalibrationError, PhalanxError
 from common.messages import Command, Gesture, Health
-from master.console.controls import (
-    Range,
-    Tuner,
-    full_frame_uv,
-    hand_line,
-    save_filter,
-    try_filter,
-    update_copy,
-)
+from master.console.controls import FilterTuner, Tuner, full_frame_uv, hand_line, update_copy
 from master.console.link import PreviewLeases
 from master.console.pages.outputs import change_output
 from master.console.recording_panel import recording_path, start_playing
 from master.console.serving import names_of, refusal
 from master.console.state import KEPT, ConsoleSettings, ConsoleState, History, Newest, ReceivedGestures
 from tests.master.console.fakes import FakeSlave, pose, tree
+from tests.memory_bus import LoopbackBus
 from tests.network_helpers import until
 
 
@@ -39,11 +32,11 @@ def test_a_tuner_goes_back_to_what_was_before_the_first_change_or_saved_last(sla
     assert tuner.set({"exposure_us": 6500.0}).wanted["exposure_us"] == 6500.0
     tuner.pick("index", (159.5, 100.0), 123)
     assert slave.verbs("pick")[-1]["t_ns"] == 123
-    assert tuner.refresh().markers["index"] == Range((44, 80, 60), (44, 250, 250))
+    assert tuner.refresh().markers["index"] == HsvRange(hsv_low=(44, 80, 60), hsv_high=(44, 250, 250))
     back = tuner.revert()
     assert back.wanted["exposure_us"] == 5000.0
-    assert back.markers["index"] == Range((15, 90, 40), (25, 255, 255))
-    assert back.markers["back"] == Range((170, 90, 40), (0, 255, 255)), (
+    assert back.markers["index"] == HsvRange(hsv_low=(15, 90, 40), hsv_high=(25, 255, 255))
+    assert back.markers["back"] == HsvRange(hsv_low=(170, 90, 40), hsv_high=(0, 255, 255)), (
         "a hue that wraps comes back as it was"
     )
     assert "ring" not in tuner.forget("ring").markers
@@ -61,7 +54,8 @@ def test_a_tuner_goes_back_to_what_was_before_the_first_change_or_saved_last(sla
 def test_what_a_slave_elsewhere_saves_comes_to_the_copy_of_this_machine(
     slave: FakeSlave, tmp_path: Path
 ) -> None:
-    copy = tmp_path / "copy.json"
+    copy = tmp_path / "copy" / "cameras" / "left.json"
+    copy.parent.mkdir(parents=True)
     save(copy, slave.camera)
     tuner = Tuner("left", slave.answer)
     assert not update_copy(copy, tuner.save()), "the same: nothing is written"
@@ -74,6 +68,12 @@ def test_what_a_slave_elsewhere_saves_comes_to_the_copy_of_this_machine(
     assert made.markers == there.markers
     assert made.intrinsics == there.intrinsics
     assert made.provenance["markers"].tool == "console"
+    (kept,) = (tmp_path / "copy").glob("old/*/cameras/left.json")
+    assert load(kept, CameraCalibration).exposure_us == 5000.0
+    tuner = Tuner("left", slave.answer, copy)
+    tuner.set({"exposure_us": 7002.5})
+    tuner.save()
+    assert load(copy, CameraCalibration).exposure_us == 7002.5
 
 
 def test_a_tuner_passes_on_what_a_slave_refuses_and_has_nothing_to_revert_before_it_answered() -> None:
@@ -101,15 +101,32 @@ def test_a_filter_is_tried_by_command_and_saved_with_its_source(tmp_path: Path) 
 
     path = tree(tmp_path) / "rigs" / "desk.json"
     before = load(path, RigCalibration)
-    try_filter(ask, "desk", {"beta": 80.0})
+    tuner = FilterTuner("desk", path, ask)
+    tuner.set({"beta": 80.0})
     assert json.loads(commands[0].body) == {"rig": "desk", "filter": {"beta": 80.0}}
-    save_filter(path, {"beta": 80.0})
+    tuner.save()
     after = load(path, RigCalibration)
     assert (after.filter.beta, after.filter.min_cutoff_hz) == (80.0, before.filter.min_cutoff_hz)
     assert after.provenance["filter"].tool == "console"
+    tuner.set({"min_cutoff_hz": -1.0})
     with pytest.raises(CalibrationError, match="min_cutoff_hz"):
-        save_filter(path, {"min_cutoff_hz": -1.0})
+        tuner.save()
     assert load(path, RigCalibration) == after, "a value out of range changes nothing"
+    tuner.revert()
+    assert json.loads(commands[-1].body)["filter"] == msgspec.to_builtins(after.filter)
+
+
+def test_a_filter_can_be_saved_while_no_master_runs(tmp_path: Path) -> None:
+    def ask(command: Command) -> Health:
+        raise BusError(f"no answer from {command.target!r}")
+
+    path = tree(tmp_path) / "rigs" / "desk.json"
+    tuner = FilterTuner("desk", path, ask)
+    tuner.refresh()
+    with pytest.raises(BusError):
+        tuner.set({"beta": 80.0})
+    assert tuner.now.wanted["beta"] == 80.0
+    assert tuner.save().wanted["beta"] == 80.0
 
 
 def test_looking_asks_for_all_that_anybody_wants_tinted_and_ends() -> None:
@@ -164,11 +181,11 @@ def test_gestures_last_until_they_end_or_are_not_heard_and_events_are_bounded() 
     for k in range(100):
         publish("end", 3.0 + k, "tap")
     assert len(received.events()) == KEPT
-    assert received.events()[0].received_s == 102.0
+    assert received.events()[0][0] == 102.0
 
 
 def test_the_bus_cannot_fill_the_memory_with_names() -> None:
-    newest: Newest[Health] = Newest()
+    newest: Newest[str, Health] = Newest()
     for k in range(1000):
         newest.put(f"p{k}", Health(f"p{k}", 1, 1, {}, {}))
     assert len(newest.present()) == 64

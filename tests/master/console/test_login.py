@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from starlette.routing import BaseRoute, Mount, WebSocketRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from common.bus.bus import LoopbackBus
 from common.errors import PhalanxError
 from master.console.app import PAGES, LoginPage, console_app, login_of, register
 from master.console.login import (
@@ -31,6 +30,7 @@ from master.console.login import (
 )
 from master.console.serving import same_user
 from master.console.state import ConsoleSettings, ConsoleState
+from tests.memory_bus import LoopbackBus
 
 PASSWORD = "correct horse battery"
 CHEAP = PasswordHash.of(PASSWORD, n=16)

@@ -18,7 +18,6 @@ from common.calibration import (
 )
 from common.errors import CalibrationError, PhalanxError
 from common.hand.model import HandModel
-from common.messages import Health
 from master.calibrate.tree_files import provenance
 from master.console.setup.files import (
     KEY_FILE,
@@ -35,7 +34,6 @@ from master.console.setup.files import (
     write_cameras,
     write_rig,
 )
-from master.console.setup.panel_colours import keep_colours, pixel_of, ranges_of
 from master.console.setup.session import Done, steps_of
 
 LENS = Intrinsics(fx_px=500.0, fy_px=500.0, cx_px=320.0, cy_px=240.0)
@@ -96,8 +94,9 @@ def test_from_an_empty_folder_each_step_is_done_by_its_files_alone(tmp_path: Pat
     HandModel.of(load(tree / "hands" / "desk-right.json", HandProfile))
     measured(tree)
     assert states(tree, settings) == {**dict.fromkeys(to_do, Done.DONE), "colours": Done.TO_DO}
-    for name in ("left", "right"):
-        keep_colours(tree, name, dict.fromkeys(load(tree / "rigs/desk.json", RigCalibration).markers, RANGE))
+    colours = dict.fromkeys(load(tree / "rigs/desk.json", RigCalibration).markers, RANGE)
+    for path in (tree / "cameras").glob("*.json"):
+        save(path, replace(load(path, CameraCalibration), markers=colours))
     assert set(states(tree, settings).values()) == {Done.DONE}
 
 
@@ -173,26 +172,3 @@ def test_a_file_that_is_replaced_is_kept(tmp_path: Path) -> None:
     replace_file(tmp_path, path, b"two")
     (kept,) = tmp_path.glob("old/*/rigs/desk.json")
     assert (kept.read_bytes(), path.read_bytes()) == (b"one", b"two")
-
-
-def test_a_click_on_half_a_picture_is_a_pixel_of_the_whole() -> None:
-    camera = new_file("usb", "vga60", "left", Path())
-    assert pixel_of(camera, (320, 240), (0.0, 0.0)) == (0.5, 0.5)  # between the first two pixels
-    assert pixel_of(camera, (640, 480), (12.0, 34.0)) == (12.0, 34.0)
-    assert pixel_of(camera, (320, 240), (319.6, -2.0)) == (639.0, 0.0)
-
-
-def test_colours_that_a_camera_reports() -> None:
-    metrics = {f"marker.index.{letter}_{end}": float(value) for letter, end, value in _PICKED_RANGES}
-    health = Health("left", 1, 0, {}, {**metrics, "rate_hz": 60.0})
-    assert ranges_of(health) == {"index": HsvRange(hsv_low=(170, 60, 61), hsv_high=(9, 255, 254))}
-
-
-_PICKED_RANGES = (
-    ("h", "low", 170),
-    ("s", "low", 60),
-    ("v", "low", 61),
-    ("h", "high", 9),
-    ("s", "high", 255),
-    ("v", "high", 254),
-)

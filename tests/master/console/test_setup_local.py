@@ -4,23 +4,16 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 
 import pytest
 
 from common.errors import PhalanxError
 from master.console.local import LocalProcesses
 from master.console.process_supervisor import watch
+from tests.network_helpers import until
 
 WAIT_S = 60.0
-
-
-def until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def there(pid: int) -> bool:
@@ -44,7 +37,7 @@ def test_lines_input_and_exit_code(local: LocalProcesses) -> None:
     code = "import os, sys; print(os.environ['WORD']); print(input().upper()); sys.exit(3)"
     one = local.start("echo", [sys.executable, "-c", code], {"WORD": "hello"})
     one.send("enter")
-    until(lambda: one.ended() is not None and len(one.lines) == 2)
+    assert until(lambda: one.ended() is not None and len(one.lines) == 2)
     assert (one.ended(), one.tail(), one.stopped) == (3, ["hello", "ENTER"], False)
     one.send("nobody reads this")  # raises nothing
     assert local.running() == {}
@@ -56,17 +49,17 @@ def test_a_question_without_an_end_of_line_is_heard_and_a_line_that_is_written_o
     expected = "import sys\nsys.stdout.write('1 %\\r2 %\\n')\nx = input('how far, in Å? ')"
     code = f"{expected}\nprint(x)\nsys.stdout.write('end')"
     one = local.start("ask", [sys.executable, "-c", code], {"PYTHONIOENCODING": "utf-8"})
-    until(lambda: one.prompt == "how far, in Å? ")
+    assert until(lambda: one.prompt == "how far, in Å? ")
     assert list(one.lines) == ["2 %"]
     one.send("3")
-    until(lambda: one.ended() is not None and one.tail()[-1] == "end")
+    assert until(lambda: one.ended() is not None and one.tail()[-1] == "end")
     assert list(one.lines) == ["2 %", "how far, in Å? 3", "end"]
 
 
 def test_what_does_not_end_is_killed_and_a_name_runs_once(local: LocalProcesses) -> None:
     deaf = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up'); time.sleep(99)"
     first = local.start("deaf", [sys.executable, "-c", deaf], {})
-    until(lambda: list(first.lines) == ["up"])
+    assert until(lambda: list(first.lines) == ["up"])
     assert first.stop(0.1) == -signal.SIGKILL
     assert first.stopped
     sleeper = [sys.executable, "-c", "import time; time.sleep(99)"]
@@ -104,4 +97,4 @@ def test_a_console_that_is_killed_leaves_nothing_behind() -> None:
     console.kill()
     console.wait(WAIT_S)
     console.stdout.close()
-    until(lambda: not there(pid))
+    assert until(lambda: not there(pid))

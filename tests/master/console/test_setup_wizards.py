@@ -1,7 +1,6 @@
 """Wizards: one for each calibration, forms that say what the commands take, jobs that run and are taken over."""
 
 import sys
-import time
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -9,18 +8,18 @@ import pytest
 from msgspec.structs import replace
 
 from common.bus.keys import rig_key
-from common.calibration import RigCalibration, load
 from common.errors import CalibrationError
 from master.cli.table import CALIBRATIONS
 from master.commands.keys import make
 from master.console.local import LocalProcesses
 from master.console.setup.commands import VIEWS, Commands, arguments_of, epoch_of, fields_of
 from master.console.setup.files import CameraPlan, Plan, write_cameras, write_rig
-from master.console.setup.job import Job, JobState, Stage, fault, progress, share_of
+from master.console.setup.job import Job, JobState, Stage, fault, progress
 from master.console.setup.panel_lens import judged
 from master.console.setup.wizards import FILLED, WIZARDS
 from master.console.state import ConsoleSettings
 from tests.cli import invoke
+from tests.network_helpers import until
 
 WAIT_S = 60.0
 
@@ -73,9 +72,9 @@ def test_values_become_the_command_line() -> None:
 
 
 def test_lines_show_the_progress() -> None:
-    assert share_of("view 7 of 25: left and right; for left, tilt it") == 7 / 25
-    assert share_of("fitting  40 %") == 0.4
-    assert share_of("left: hold it still") is None
+    assert progress(["view 7 of 25: left and right; for left, tilt it"]) == 7 / 25
+    assert progress(["fitting  40 %"]) == 0.4
+    assert progress(["left: hold it still"]) is None
     assert progress(["view 1 of 4: a", "left: hold it still", "view 2 of 4: b", "hold"]) == 0.5
     assert progress([]) is None
 
@@ -151,26 +150,19 @@ def test_a_job_is_cancelled_or_ended_early(tree: Path) -> None:
     )
     try:
         job = job_of(tree, local, waits, "print('then')")
-        _until_up(job)
+        assert until(lambda: "up" in job.text)
         job.finish()
         assert job.wait(WAIT_S) is JobState.DONE
         assert job.text == ["up", "then"]
         other = Job(
             "Other", [lambda: Stage("one", {"x": [sys.executable, "-c", waits]})], local, {}, tree, tree / "w"
         )
-        _until_up(other)
+        assert until(lambda: "up" in other.text)
         other.cancel()
         assert other.wait(WAIT_S) is JobState.CANCELLED
         assert local.running() == {}
     finally:
         local.close()
-
-
-def _until_up(job: Job) -> None:
-    deadline = time.monotonic() + WAIT_S
-    while "up" not in job.text:
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def test_command_lines_are_ones_that_the_programs_take(tree: Path) -> None:
@@ -242,7 +234,3 @@ def test_residuals_in_words() -> None:
     assert "Fair" in judged(figures(0.8, 0.1))
     assert "Repeat" in judged(figures(0.2, 2.0))
     assert "Repeat" in judged(figures(2.0, 0.1))
-
-
-def test_a_rig_file_of_the_set_up_is_one(tree: Path) -> None:
-    assert load(tree / "rigs" / "desk.json", RigCalibration).cameras == ("left", "right")

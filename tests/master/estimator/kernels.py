@@ -12,7 +12,7 @@ from master.estimator.kinematics import Scratch, angles_of, chains, twist_hand
 from master.estimator.parameters import truncated_mean
 from master.estimator.posterior import Model
 from master.estimator.priors import PosturePrior
-from master.estimator.problem import Observations, Rig, marker_rows, rotation_vector_jacobian
+from master.estimator.problem import Observations, Problem, Rig, marker_rows, rotation_vector_jacobian
 from master.estimator.sensors import CameraArrays, flexed_palm, project
 from master.estimator.solve import linearise
 from master.estimator.state import grow, hide, keep_extras, predict_extras
@@ -41,18 +41,13 @@ def linearise_at(
     boxed_prior: Any,
     observed: Observations,
     h: int,
-    T: Float,
-    x: Float,
-    z: Float,
-    gradient: Float,
-    normal: Float,
+    boxed_at: Any,
     boxed_search: Any,
 ) -> float:
     """`master.estimator.solve.linearise`; records in their arrays."""
-    rig = Rig(model.hand[0], model.mounts, model.cameras, model.device[0])
-    return linearise(
-        rig, posture_prior, boxed_prior[0], observed, h, T, x, z, gradient, normal, boxed_search[0]
-    )
+    rig = Rig(model.hand[0], model.settings[0], model.mounts, model.cameras, model.device[0])
+    problem = Problem(rig, posture_prior, boxed_prior[0], observed)
+    return linearise(problem, h, boxed_at[0], boxed_search[0])
 
 
 @kernel
@@ -105,13 +100,13 @@ def joint_covariances(
     whole: Float,
 ) -> None:
     """Write the joints' covariances (26, 3, 3) [m^2] by derivatives alone, and with arcs."""
-    hand, settings, work, scratch = model.hand[0], model.settings[0], boxed_work[0], boxed_scratch[0]
-    rig = Rig(hand, model.mounts, model.cameras, model.device[0])
-    angles_of(hand, x, work.angles, work.by)
-    chains(hand, T, work.angles, work.R, work.P)
+    hand, work, scratch = model.hand[0], boxed_work[0], boxed_scratch[0]
+    rig = Rig(hand, model.settings[0], model.mounts, model.cameras, model.device[0])
+    angles_of(hand, x, work)
+    chains(hand, T, work)
     linear(hand, T, cov, work, scratch, straight)
     linear(hand, T, cov, work, scratch, whole)
-    add_second_order(rig, settings, T, cov, seen, information, work, scratch, whole)
+    add_second_order(rig, T, cov, seen, information, work, scratch, whole)
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""Three markers on the back of the hand tell the solver how the palm is turned; one alone does not, an IMU does."""
+"""Three markers on the back of the hand determine how the palm is turned; one alone does not, an IMU does."""
 
 import numpy as np
 import pytest

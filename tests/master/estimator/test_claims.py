@@ -9,7 +9,7 @@ from bench.hands.certainty import NOISE_M, Coverage, compared, joined, kinds
 from common.arrays import Float
 from common.geometry.transforms import rigid
 from common.hand.model import CHAINS, PALM, TIPS, HandModel
-from common.records import boxed
+from common.records import boxed, record
 from common.sim.motion import HandMotion, ScriptedMotion, StudyPoses
 from master.estimator.covariance import CovarianceScratch
 from tests.hand_helpers import RIGHT, natural_angles, palm
@@ -24,7 +24,7 @@ CENTRE = np.array([0.0, 0.0, 0.5])
 def surer(now: Float, past: Float) -> Float:
     """In each direction that of the surer of two covariances (n, n)."""
     out = np.empty_like(now)
-    surer_at(now, past, boxed(CovarianceScratch.empty(len(now), 2)), out)
+    surer_at(now, past, boxed(record(CovarianceScratch, N=len(now), M=2)), out)
     return out
 
 
@@ -103,7 +103,7 @@ def test_uncertainty_of_a_lost_hand_grows_the_faster_the_faster_it_went() -> Non
     still, moving = (sigma_m(history(NOBODY, 28, speed), PALM) for speed in (0.0, 0.5))
     for claims in (still, moving):
         assert (np.diff(claims)[1:] > 0.0).all()
-        assert claims[1] > 0.95 * claims[0]  # no marker tells any more about which point the palm turns
+        assert claims[1] > 0.95 * claims[0]  # no marker fixes any more the point about which the palm turns
     assert moving[-1] > 3.0 * still[-1]
     assert moving[-1] > 0.5 * 0.5 * 28 / 60  # half the way it would have gone on
 
@@ -139,7 +139,7 @@ def test_second_order_covariance_is_as_wide_as_drawn_hands_are() -> None:
 
 @pytest.mark.parametrize("gone", [(), (3,), (0, 4)])
 def test_the_scatter_of_a_fit_is_that_which_its_covariance_says(gone: tuple[int, ...]) -> None:
-    """One hand of the habits, its markers drawn anew: 95 % regions of all joints hold it, without being vast."""
+    """One hand of the posture prior, its markers drawn anew: 95 % regions of all joints hold it, without being vast."""
     rng, inside, claims, errors = np.random.default_rng(13), list[Float](), list[Float](), list[Float]()
     for _ in range(80):
         T, angles = palm(rng.uniform(-15.0, 15.0, 3)), natural_angles(rng)

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from common.records import boxed
+from common.records import boxed, record
 from master.estimator.problem import EpochPrior
 from master.estimator.sensors import EXTRAS, HEADING, LED_SCALE, RATE, TILT, WRIST_ANGLES
 from master.estimator.settings import DEFAULT
-from master.estimator.state import ExtrasScratch, HandState, stationary_of
+from master.estimator.state import ExtrasScratch, stationary_of, unknown_hand
 from tests.master.estimator.kernels import keep_extras_at, predict_extras_at
 
 N = 8
@@ -22,13 +22,14 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 class Extras:
-    """Extras of a hand, and what is believed of them."""
+    """Extras of a hand, and their prior."""
 
     def __init__(self, *, loose: bool = True) -> None:
-        self.state = HandState.unknown(N, EXTRAS)
+        self.state = unknown_hand(n=N, K=EXTRAS, N=6 + N + EXTRAS)
         self.state.stationary[:] = stationary_of(DEFAULT, loose=loose, tilt_rad=TILT_RAD)
         self.state.z_cov[:] = np.diag(self.state.stationary)
-        self.epoch_prior, self.scratch = EpochPrior.none(N, EXTRAS), ExtrasScratch.empty(EXTRAS)
+        self.epoch_prior = record(EpochPrior, n=N, K=EXTRAS)
+        self.scratch = record(ExtrasScratch, K=EXTRAS)
 
     @property
     def mean(self) -> Float:
@@ -60,7 +61,7 @@ class Extras:
 
 
 def drawn(seed: int) -> tuple[Float, Float]:
-    """A mean and a covariance, none more doubtful than usual."""
+    """A mean and a covariance, none wider than usual."""
     rng = np.random.default_rng(seed)
     stationary = np.sqrt(Extras().state.stationary)
     root = rng.normal(size=(EXTRAS, EXTRAS)) * 0.2
@@ -170,7 +171,7 @@ def test_an_epoch_long_after_the_last_counts_as_a_whole_and_one_at_once_not_at_a
 
 
 def test_what_is_constant_is_learnt_by_the_second_and_not_by_the_frame() -> None:
-    """A second of epochs at 30 and at 120 Hz tells as much of it."""
+    """A second of epochs at 30 and at 120 Hz measures as much of it."""
     left: list[float] = []
     for rate_hz in (30, 120):
         extras, information = Extras(), np.zeros((EXTRAS, EXTRAS))

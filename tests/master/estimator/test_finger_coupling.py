@@ -1,4 +1,4 @@
-"""How MCP and PIP of a hand go together is learnt from the fingers whose tips are seen."""
+"""How MCP and PIP of a hand are coupled is learnt from the fingers whose tips are seen."""
 
 from pathlib import Path
 
@@ -57,7 +57,7 @@ def test_a_hand_that_follows_no_share_is_not_taken_to(wrist_case: WristCase) -> 
 
 
 def test_a_hand_that_keeps_to_its_share_is_tracked_by_the_laser_alone(wrist_case: WristCase) -> None:
-    """As long as nothing is learnt it is vague, and vaguer where the hand defies habit."""
+    """As long as nothing is learnt it is vague, and vaguer where the hand defies the prior."""
     fresh, stationary = laser_alone(wrist_case, pipeline(wrist_case, continuous=True))
     pose, close = laser_alone(wrist_case, learnt(wrist_case, 0.54))
     other, wide = laser_alone(wrist_case, learnt(wrist_case, 0.54, 30.0))

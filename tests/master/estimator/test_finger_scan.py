@@ -1,4 +1,4 @@
-"""The search along a finger's valley: for every PIP the best of the other angles, and which hand they tell."""
+"""The search along a finger's minima: for every PIP the best of the other angles, and which hand is likely."""
 
 from pathlib import Path
 from typing import Literal
@@ -38,7 +38,7 @@ def scan_of(line: WristPipeline) -> Scan:
 def scanned(
     wrist_case: WristCase, angles: Float, solver_mode: Literal["fk", "auto"] = "auto", tip_px: float = 2.0
 ) -> Scan:
-    """The valleys of a hand of angles (5, 4)."""
+    """The minima of a hand of angles (5, 4)."""
     line, seen = pipeline(wrist_case, solver_mode), wrist_case.message(angles)
     pushed(line, message(seen.laser_uv, seen.tip_uv, tip_px=tip_px))
     return scan_of(line)
@@ -51,7 +51,7 @@ def nodes(wrist_case: WristCase, f: int) -> Float:
 
 
 def on_profile(wrist_case: WristCase, scan: Scan, f: int, pip: float) -> Float:
-    """Angles and twist (5,) where the valley has that PIP."""
+    """Angles and twist (5,) where the minimum has that PIP."""
     return np.array([np.interp(pip, nodes(wrist_case, f), scan.x[f, :, k]) for k in range(5)])
 
 
@@ -118,7 +118,7 @@ def test_the_estimate_lies_on_the_profile_and_its_spread_is_that_of_the_density(
 
 
 def test_where_a_finger_was_decides_between_two_poses_that_look_alike(wrist_case: WristCase) -> None:
-    """A finger that comes from either side of a pose with a twin stays on that side."""
+    """A finger that comes from either side of a pose that looks like another stays on that side."""
     alone = pipeline(wrist_case)
     duplicates: list[tuple[float, float, int]] = []
     t_ns = 0

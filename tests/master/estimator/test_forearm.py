@@ -1,4 +1,4 @@
-"""An IMU on the forearm: what is learnt of heading and bend from palms that markers tell, and what is left without."""
+"""An IMU on the forearm: what is learnt of heading and bend from palms by markers, and what is left without."""
 
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from common.geometry.transforms import (
     rotation_vector_to_matrix,
 )
 from common.hand.wrist import forearm_palm
-from master.estimator.epoch import CycleReader, Epoch, Fitted, OrientationMeasurement
+from master.estimator.epoch import Epoch, Fitted, OrientationMeasurement
 from master.estimator.estimator import Estimator
 from master.estimator.priors import WristModel, loosened
 from master.estimator.sensors import HEADING, RATE, WRIST_ANGLES
@@ -39,7 +39,7 @@ IMU = ImuCalibration(q_palm_imu=MOUNTED, q_rig_world=WORLD, orientation_sigma_ra
 PLACE = np.array([0.0, 0.08, 0.5])
 ANGLES = np.zeros((5, 4))
 ANGLES[1:, 1:] = np.radians([20.0, 35.0, 23.0])
-RIGHT, COV = MODELS["right"], small_cov(count=8)  # three markers on the back tell the palm
+RIGHT, COV = MODELS["right"], small_cov(count=8)  # three markers on the back determine the palm
 NOWHERE = np.full((8, 3), nan)
 
 
@@ -85,7 +85,7 @@ class WristCase:
         wrist_case = wrist_setup(root).wrist
         assert wrist_case is not None
         setup, counts = replace(wrist_case, model=RIGHT, imu=imu), Counter[str]()
-        side = WristSide(setup, CycleReader(setup, None, counts), counts, continuous=continuous)
+        side = WristSide(setup, counts, continuous=continuous)
         model = WristModel.of(setup, loose=True)
         estimator = Estimator(PAIR, loosened(RIGHT), MARKERS, MARKERS, continuous=continuous, wrist=model)
         return cls(side, estimator)
@@ -179,7 +179,7 @@ def test_nothing_is_said_of_the_palm_before_a_heading_is_known(root: Path) -> No
     wrist_case.played(arm, range(0, 100), seen=False)
     assert wrist_case.orientation(50) is None
     assert 10.0 < wrist_case.wrist_sigma_deg.min() < wrist_case.wrist_sigma_deg.max() < 15.0
-    for t_ms in (96, 112):  # the first palm tells the heading of a straight wrist, the next how it is bent
+    for t_ms in (96, 112):  # the first palm gives the heading of a straight wrist, the next how it is bent
         wrist_case.epoch(arm, t_ms)
     orientation = wrist_case.orientation(112)
     assert orientation is not None
@@ -308,7 +308,7 @@ def test_samples_that_are_missing_or_nan_change_nothing(root: Path) -> None:
     assert after is not None
     np.testing.assert_array_equal(after.rotation, before.rotation)
     assert wrist_case.counts["orientation.missing"] == 1
-    hand = wrist_case.epoch(arm, 2_400)  # no sample is near: markers alone tell the palm
+    hand = wrist_case.epoch(arm, 2_400)  # no sample is near: markers alone determine the palm
     assert wrist_case.counts["orientation.absent"] > 0
     assert degrees(found(hand.solution).T_rig_palm[:3, :3], arm.palm(2_400)) < 3.0
     learnt = wrist_case.heading_off_deg(arm)
@@ -328,7 +328,7 @@ def test_in_its_own_world_the_palm_is_bent_as_well(root: Path) -> None:
 
 
 def test_the_bend_is_within_what_is_claimed(root: Path) -> None:
-    """Of waving wrists: in 95 % regions at most times; what is believed of any wrist is wide."""
+    """Of waving wrists: in 95 % regions at most times; what is assumed of any wrist is wide."""
     inside: list[bool] = []
     for seed in range(6):
         arm, wrist_case = Arm(1.0, seed + 20), WristCase.of(root)

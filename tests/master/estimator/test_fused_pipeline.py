@@ -10,8 +10,8 @@ from bench.played import START_NS
 from common.arrays import Bool
 from common.hand.model import CHAINS
 from common.messages import HandPose, ImuSample, MarkerDetections, SolverMode, Source, WristDetections
+from master.estimator.pipeline import MarkerPipeline
 from master.estimator.settings import DEFAULT
-from master.estimator.wrist_pipeline import FusedPipeline
 from master.rig.pipeline import pipeline_of
 from master.run.app import StageTimes
 
@@ -120,13 +120,13 @@ def test_fingers_are_better_with_the_wrist_device_than_without(seen: Seen, whole
     assert np.nanmean(whole.pip_deg[:, 1:]) < np.nanmean(markers.pip_deg[:, 1:])
 
 
-def door(seen: Seen) -> FusedPipeline:
+def door(seen: Seen) -> MarkerPipeline:
     found = pipeline_of(seen[0].fused, StageTimes())
-    assert isinstance(found, FusedPipeline)
+    assert isinstance(found, MarkerPipeline)
     return found
 
 
-def pushed(pipeline: FusedPipeline, messages: list[Observed]) -> list[HandPose]:
+def pushed(pipeline: MarkerPipeline, messages: list[Observed]) -> list[HandPose]:
     out: list[HandPose] = []
     for message in messages:
         if isinstance(message, ImuSample):

@@ -93,7 +93,7 @@ def test_a_little_better_is_not_clearly_better() -> None:
 
 def test_on_one_epipolar_line_the_last_place_decides() -> None:
     first, second = seen(PAIR, IN_ROW, MARKER), seen(PAIR, MARKER, None)
-    assert not choose(PAIR, first, second).taken.any()  # it cannot be told: the slave's choice stands
+    assert not choose(PAIR, first, second).taken.any()  # it is ambiguous: the slave's choice stands
     chosen = choose(PAIR, first, second, near(MARKER))
     np.testing.assert_array_equal(chosen.uv[0], second[0])
     assert not choose(PAIR, first, second, near(IN_ROW, 2.0)).taken.any()

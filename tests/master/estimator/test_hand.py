@@ -45,7 +45,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def prior_hand(model: HandModel) -> tuple[Float, Settings]:
-    """A pose that every habit expects, and the settings with a thumb that can be like that."""
+    """A pose that every posture prior expects, and the settings with a thumb that can be like that."""
     thumb = np.radians([8.0, 8.0, 12.0, 12.0]).tolist()
     angles = np.zeros((5, 4))
     pip = DEFAULT.pip_mean_rad
@@ -60,7 +60,7 @@ def prior_hand(model: HandModel) -> tuple[Float, Settings]:
 
 
 def expecting(model: HandModel) -> tuple[Float, Estimator]:
-    """A pose, and an estimator whose habits expect it."""
+    """A pose, and an estimator whose prior expects it."""
     angles, settings = prior_hand(model)
     return angles, forgetful(model, settings=settings)
 
@@ -260,7 +260,7 @@ def test_an_unseen_tip_is_less_sure_than_a_seen_one() -> None:
 
 
 def test_the_error_is_as_large_as_the_covariance_says() -> None:
-    """Squared joint errors over their variances average to about 1 for hands drawn near the habits."""
+    """Squared joint errors over their variances average to about 1 for hands drawn near the posture prior."""
     rng = np.random.default_rng(4)
     ratio: list[float] = []
     for _ in range(60):
@@ -305,7 +305,7 @@ def test_covariances_of_joints_and_directions_are_those_of_numpy() -> None:
     orientation = (J[ends] - J[before]) / np.linalg.norm(p[ends] - p[before], axis=1)[:, None, None]
     expected = orientation @ hand.measurement_cov @ orientation.swapaxes(1, 2)
     np.testing.assert_allclose(hand.tilt_cov_rad2, expected, atol=1e-5 * np.abs(expected).max())
-    # A bending joint turns the end of its finger as fast as it bends itself: MCP, PIP and DIP = 2/3 PIP together.
+    # A bending joint turns the end of its finger as fast as it bends itself: MCP, PIP and DIP = 2/3 PIP at once.
     rate = np.concatenate(
         [np.full(6, DEFAULT.palm_process_noise_rad_s), np.full(FREE, DEFAULT.process_noise_rad_s)]
     )
@@ -321,7 +321,7 @@ def test_covariances_of_joints_and_directions_are_those_of_numpy() -> None:
 @given(seeds)
 @settings(max_examples=8)
 def test_where_a_search_begins_does_not_decide_where_it_ends(rotated_deg: float, seed: int) -> None:
-    """Nothing of a hand that may be near is believed: one that is not near leads to the same markers."""
+    """Nothing of a hand that may be near is assumed: one that is not near leads to the same markers."""
     rng = np.random.default_rng(seed)
     T, cov = palm(), small_cov()
     points = places(T, natural_angles(rng))

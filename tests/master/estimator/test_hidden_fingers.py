@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.records import boxed
+from common.records import boxed, record
 from master.estimator.parameters import HandTables
 from master.estimator.sensors import NO_EXTRAS
 from master.estimator.settings import DEFAULT
-from master.estimator.state import NEVER_NS, HandState, Hidden
+from master.estimator.state import NEVER_NS, Hidden, unknown_hand
 from tests.hand_helpers import RIGHT, within
 from tests.master.estimator.fitted import FREE, PARAMETERS, STEP_NS
 from tests.master.estimator.kernels import hide_at
@@ -23,7 +23,7 @@ TABLES, SETTINGS = HandTables.of(RIGHT, PARAMETERS), DEFAULT.record()
 
 @dataclass(frozen=True)
 class HiddenFingers:
-    """What is believed of fingers that nobody sees: (5, 4) [rad], their (5, 4) [rad], (5,) [s]."""
+    """Prediction of fingers that nobody sees: (5, 4) [rad], their (5, 4) [rad], (5,) [s]."""
 
     angles_rad: Float
     sigma_rad: Float
@@ -34,7 +34,7 @@ class Memory:
     """The state of a hand, of which only the angles are set."""
 
     def __init__(self, natural: float = 1.0) -> None:
-        self.state = HandState.unknown(FREE, NO_EXTRAS)
+        self.state = unknown_hand(n=FREE, K=NO_EXTRAS, N=6 + FREE + NO_EXTRAS)
         self.state.natural_weight[0] = natural
 
     def moved(self, before_rad: Float, after_rad: Float, dt_s: float) -> None:
@@ -45,7 +45,7 @@ class Memory:
 
     def epoch_prior(self, t_ns: int, last_ns: int, last_rad: Float, shown: frozenset[int]) -> HiddenFingers:
         """Where fingers that are not shown are now, if the hand was like that a moment ago."""
-        hidden = Hidden.none(FREE)
+        hidden = record(Hidden, n=FREE)
         self.state.angles[:], self.state.t_ns[0] = last_rad.reshape(20), last_ns
         seen = np.isin(np.arange(5), list(shown))
         boxes = boxed(TABLES), boxed(SETTINGS), boxed(self.state)
@@ -151,7 +151,7 @@ def test_an_epoch_that_is_fitted_twice_still_knows_when_a_finger_was_seen_last()
         boxed(memory.state),
         2 * STEP_NS,
         np.ones(5, np.bool_),
-        boxed(Hidden.none(FREE)),
+        boxed(record(Hidden, n=FREE)),
     )
     assert memory.state.hidden_ns[RING] == 0
 

@@ -1,4 +1,4 @@
-"""Tests of what one instant tells of a hand: a held pose is no second witness, and errors are as large as claimed."""
+"""Tests of what one epoch measures of a hand: a held pose is no second witness, and errors are as large as claimed."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from tests.hand_helpers import RIGHT, palm, small_cov
 from tests.master.estimator.fitted import estimator, fit, found, places, push
 
 NATURAL = np.radians([[8.0, 8.0, 10.0, 15.0]] + [[0.0, 15.0, 25.0, 50.0 / 3]] * 4)
-# two fingers straight, two bent, all far apart: against habits
+# two fingers straight, two bent, all spread: against the posture prior
 UNNATURAL = np.radians(
     [
         [20.0, 20.0, 0.0, 40.0],
@@ -44,13 +44,13 @@ def test_a_pose_that_is_held_makes_its_directions_no_surer(dt_s: float) -> None:
 
 
 def test_a_hand_against_the_posture_prior_is_less_sure_than_a_relaxed_one() -> None:
-    relaxed, odd = tilt_deg(solved(NATURAL)), tilt_deg(solved(UNNATURAL))
+    relaxed, unnatural = tilt_deg(solved(NATURAL)), tilt_deg(solved(UNNATURAL))
     assert (relaxed < 17.0).all()
-    assert np.median(odd / relaxed) > 1.5
+    assert np.median(unnatural / relaxed) > 1.5
 
 
 def test_priors_that_contradict_each_other_are_no_information_about_the_epoch() -> None:
-    """A finger out of sight is believed curled, and its neighbours alike: counted as misfit, that gives 3 and more."""
+    """A finger out of sight is assumed curled, and its neighbours alike: counted as misfit, that gives 3 and more."""
     all_seen, ratio = tilt_deg(solved(NATURAL)), list[Float]()
     for gone in range(5):
         others = np.arange(5) != gone
@@ -59,7 +59,7 @@ def test_priors_that_contradict_each_other_are_no_information_about_the_epoch() 
 
 
 def test_directions_err_as_much_as_is_claimed() -> None:
-    """Over hands drawn from the habits themselves, squared errors over variances average to about 1."""
+    """Over hands drawn from the posture prior itself, squared errors over variances average to about 1."""
     rng = np.random.default_rng(5)
     s, ratio = DEFAULT, list[Float]()
     thumb = (

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from common.arrays import Float
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import rigid, rotation_vector_to_matrix
-from common.records import boxed
+from common.records import boxed, record
 from master.estimator.kinematics import BodyPoints, Scratch
 from master.estimator.parameters import HandParameters
 from master.estimator.problem import Observations
@@ -69,7 +69,7 @@ def observed_of(rng: np.random.Generator, points: Float, cameras: tuple[CameraMo
 def test_rows_of_a_marker_are_the_marginal_of_its_rays_over_what_is_wrong_with_it(seed: int) -> None:
     """The normal equations of place and shift, without the shift."""
     rng, arrays = np.random.default_rng(seed), CameraArrays.of(CAMERAS)
-    point, work = rng.uniform([-0.1, -0.1, 0.4], [0.2, 0.1, 0.8]), Scratch.empty()
+    point, work = rng.uniform([-0.1, -0.1, 0.4], [0.2, 0.1, 0.8]), record(Scratch)
     observed = observed_of(rng, np.tile(point, (6, 1)), CAMERAS)
     cost, chi2 = marker_rows_at(arrays, observed, 1, point, boxed(work))
     A, r, w = np.zeros((4, 6)), np.zeros(4), np.repeat(observed.weight[:, 1], 2)
@@ -93,12 +93,12 @@ def test_rows_of_a_marker_are_the_marginal_of_its_rays_over_what_is_wrong_with_i
 @settings(max_examples=30)
 def test_the_gradient_of_a_marker_is_that_of_its_cost(seed: int) -> None:
     rng, arrays = np.random.default_rng(seed), CameraArrays.of(CAMERAS)
-    point, work = rng.uniform([-0.1, -0.1, 0.4], [0.2, 0.1, 0.8]), Scratch.empty()
+    point, work = rng.uniform([-0.1, -0.1, 0.4], [0.2, 0.1, 0.8]), record(Scratch)
     observed = observed_of(rng, np.tile(point, (6, 1)), CAMERAS)
     observed.own[:] = 1e15 * np.eye(3)  # nothing is wrong with the markers
 
     def cost(step: Float) -> float:
-        return marker_rows_at(arrays, observed, 5, point + step, boxed(Scratch.empty()))[0]
+        return marker_rows_at(arrays, observed, 5, point + step, boxed(record(Scratch)))[0]
 
     marker_rows_at(arrays, observed, 5, point, boxed(work))
     numeric = np.array([(cost(H * e) - cost(-H * e)) / (2 * H) for e in np.eye(3)])
@@ -106,7 +106,7 @@ def test_the_gradient_of_a_marker_is_that_of_its_cost(seed: int) -> None:
 
 
 def test_a_marker_that_many_cameras_see_is_no_surer_than_its_paint() -> None:
-    arrays, work = CameraArrays.of(PAIR * 8), Scratch.empty()
+    arrays, work = CameraArrays.of(PAIR * 8), record(Scratch)
     observed = observed_of(np.random.default_rng(1), np.full((6, 3), 0.5), PAIR * 8)
     observed.weight[:], observed.own[:] = 1e4, 1e6 * np.eye(3)
     marker_rows_at(arrays, observed, 5, np.full(3, 0.5), boxed(work))
@@ -123,16 +123,16 @@ def test_points_move_with_the_angles_as_the_jacobian_says(name: str, seed: int) 
     model = MODELS[name]
     parameters = HandParameters.of(model)
     x = np.random.default_rng(seed).uniform(parameters.low, parameters.high)
-    for points in (BodyPoints.markers(model, parameters, MARKERS), BodyPoints.joints(model, parameters)):
+    points = BodyPoints.markers(model, parameters, MARKERS)
 
-        def place(x: Float, points: BodyPoints = points) -> Float:
-            return points.place(model.chains(parameters.angles(x)))
+    def place(x: Float) -> Float:
+        return points.place(model.chains(parameters.angles(x)))
 
-        chains = model.chains(parameters.angles(x))
-        J = points.jacobian(chains, points.place(chains), x)
-        for k in range(len(x)):
-            e = H * np.eye(len(x))[k]
-            np.testing.assert_allclose(J[:, :, k], (place(x + e) - place(x - e)) / (2 * H), atol=1e-8)
+    chains = model.chains(parameters.angles(x))
+    J = points.jacobian(chains, points.place(chains), x)
+    for k in range(len(x)):
+        e = H * np.eye(len(x))[k]
+        np.testing.assert_allclose(J[:, :, k], (place(x + e) - place(x - e)) / (2 * H), atol=1e-8)
 
 
 def past(whole: Whole) -> None:

@@ -1,5 +1,6 @@
-"""The fit of the card's line: a hand of habits alone, from points, that begins anew by itself."""
+"""The fit of the card's line: a hand of the posture prior alone, from points, that begins anew by itself."""
 
+from dataclasses import replace
 from math import inf
 
 import numpy as np
@@ -36,7 +37,7 @@ def test_a_natural_hand_is_found_from_its_markers_alone(model: HandModel) -> Non
 
 
 def test_too_few_markers_and_none_are_no_palm_and_a_known_one_goes_on_by_one() -> None:
-    anyway = DEFAULT._replace(back_normal_rad=inf)
+    anyway = replace(DEFAULT, back_normal_rad=inf)
     points = places(palm(), natural_angles(np.random.default_rng(3)))
     for kept, expected in ((0, False), (1, False), (2, False), (3, True)):
         few = points.copy()
@@ -62,7 +63,7 @@ def test_the_pose_is_that_of_the_model_and_markers_are_where_it_mounts_them() ->
 
 
 def test_the_covariance_of_a_fit_holds_the_palm() -> None:
-    """Of noisy markers of natural hands, of one instant alone."""
+    """Of noisy markers of natural hands, of one epoch alone."""
     rng, inside = np.random.default_rng(8), list[bool]()
     for _ in range(150):
         T = palm(rng.uniform(-20, 20, 3))

@@ -60,4 +60,4 @@ def test_a_marker_that_one_camera_loses_is_kept_on_the_ray_of_the_other() -> Non
             np.testing.assert_array_equal(hand.tracked[CHAINS[INDEX]], sure(hand)[CHAINS[INDEX]])
             assert hand.source[TIPS[INDEX]] == Source.SOLVED
     assert np.mean(off, axis=0)[0] < 4e-3
-    assert np.linalg.norm(off, axis=1).mean() < 15e-3  # its depth is that of habits
+    assert np.linalg.norm(off, axis=1).mean() < 15e-3  # its depth is that of the posture prior

@@ -1,4 +1,4 @@
-"""Tests of one hand over time: a lost finger is held and its doubt grows, and nothing jumps when it returns."""
+"""Tests of one hand over time: a lost finger is held and its covariance grows, and nothing jumps when it returns."""
 
 from dataclasses import replace
 
@@ -133,7 +133,7 @@ def test_a_returning_marker_is_accepted_at_once(gap: int) -> None:
 
 @pytest.mark.parametrize("gap", [5, 10, 25])
 def test_a_finger_that_shows_once_goes_on_as_fast_as_it_moved_since_it_was_seen_last(gap: int) -> None:
-    """How far it is from where it was believed to be is no motion of one frame."""
+    """How far it is from where it was predicted is no motion of one frame."""
     machine = estimator()
     stop = 10 + gap
     run(machine, range(10), speed_deg_s=60.0)
@@ -210,7 +210,7 @@ def test_a_finger_never_seen_is_held_by_the_posture_prior_and_not_tracked() -> N
 
 
 @pytest.mark.parametrize("step_ns", [0, -1, -10 * 10**9, -(10**15), 10**15])
-def test_time_that_stands_still_or_leaps_starts_afresh(step_ns: int) -> None:
+def test_time_that_stands_still_or_leaps_starts_anew(step_ns: int) -> None:
     machine = estimator()
     run(machine, range(6), gone=())
     run(machine, range(6, 9), gone=(MARKER_INDEX,))

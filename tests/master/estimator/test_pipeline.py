@@ -38,7 +38,7 @@ def joint_mm(pose: HandPose) -> Float:
     return 1e3 * np.linalg.norm(pose.position_m - hand_at(pose.t_ns * 1e-9).position_m, axis=1)
 
 
-# All but the thumb's metacarpal: where it is turned habits alone tell, to 23 mm.
+# All but the thumb's metacarpal: the posture prior alone determines its turn, to 23 mm.
 SURE = np.delete(np.arange(26), CHAINS[0, 0])
 
 
@@ -131,7 +131,9 @@ def test_a_thing_that_one_slave_takes_for_a_marker_is_rejected_by_the_other_came
     assert all(pose.tracked[SURE].all() for pose in poses[3:])
     assert pipeline.counts["alternative.index"] >= 18
     assert pipeline.counts["epipolar_outliers"] == pipeline.counts["unclear.index"] == 0
-    sure = build_pipeline(exact_run.setup, StageTimes())  # without the slave's doubt nothing can be chosen
+    sure = build_pipeline(
+        exact_run.setup, StageTimes()
+    )  # without the slave's alternative nothing can be chosen
     lost = solve_all(sure, mistaken(exact_run, THING, ("right",), with_alternatives=False))
     assert all(np.isnan(p.markers_raw_m[1]).all() for p in lost[22:])
     assert sure.counts["apart.index"] >= 18
@@ -158,7 +160,7 @@ def test_a_thing_that_both_slaves_take_for_a_marker_is_rejected_by_where_the_han
 
 
 def test_what_was_mistaken_long_ago_is_not_the_past_of_a_marker(exact_run: SyntheticRun) -> None:
-    """Both slaves are sure of the thing for ten frames, then doubt: the hand says what is its finger."""
+    """Both slaves are sure of the thing for ten frames, then name both: the hand decides what is its finger."""
     sure = mistaken(exact_run, OUT_OF_REACH, ("left", "right"), with_alternatives=False)
     with_alternatives = mistaken(exact_run, OUT_OF_REACH, ("left", "right"), with_alternatives=True)
     pipeline = build_pipeline(exact_run.setup, StageTimes())
@@ -244,12 +246,13 @@ def test_nothing_seen_at_all_is_a_pose_that_is_not_valid(exact_run: SyntheticRun
 
 
 def test_unrelated_frames_are_not_filtered(exact_run: SyntheticRun) -> None:
-    together = [
+    simultaneous = [
         msgspec.structs.replace(m, t_ns=m.t_ns - (m.camera == "right") * 5_000_000)
         for m in exact_run.messages
     ]
     poses = solve_all(
-        build_pipeline(exact_run.setup, StageTimes(), continuous=False), together[::20] + together[1::20]
+        build_pipeline(exact_run.setup, StageTimes(), continuous=False),
+        simultaneous[::20] + simultaneous[1::20],
     )
     for pose in poses:
         np.testing.assert_array_equal(pose.markers_m, pose.markers_raw_m)

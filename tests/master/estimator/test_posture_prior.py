@@ -1,5 +1,6 @@
-"""Tests of what is believed of a hand: natural or free by evidence, couplings that can be switched, its orientation."""
+"""Tests of the priors of a hand: natural or free by evidence, couplings that can be switched, its orientation."""
 
+from dataclasses import replace
 from math import inf
 
 import msgspec
@@ -31,7 +32,7 @@ from tests.master.estimator.fitted import (
     residual_m,
 )
 
-ANYWAY = DEFAULT._replace(back_normal_rad=inf)  # the back may look anywhere
+ANYWAY = replace(DEFAULT, back_normal_rad=inf)  # the back may look anywhere
 SOLVER, NATURAL_ONLY = forgetful(settings=ANYWAY), forgetful(natural=True, settings=ANYWAY)
 SIGMA_M = 1e-3
 COV = np.repeat(SIGMA_M**2 * np.eye(3)[None], 6, axis=0)
@@ -108,7 +109,7 @@ def test_a_mean_of_two_hands_fits_the_markers_as_well_as_each(seed: int) -> None
 
 
 def test_the_evidence_of_frames_is_joined_in_time() -> None:
-    """Whether a hand obeys habits does not change from frame to frame: of noisy frames it is less sure one by one."""
+    """Whether a hand obeys the prior does not change from frame to frame: of noisy frames one alone is less sure."""
     rng, one_by_one, joined = np.random.default_rng(8), list[float](), list[float]()
     slow, machine = DEFAULT.changed("component_memory_s", 0.3), estimator()
     assert slow.component_memory_s == 0.3
@@ -123,15 +124,15 @@ def test_the_evidence_of_frames_is_joined_in_time() -> None:
 
 
 def test_a_hand_that_leaves_the_posture_prior_gets_the_free_component_within_a_second() -> None:
-    """A relaxed hand, then one that points with two fingers apart; and back."""
+    """A relaxed hand, then one that points with two fingers spread; and back."""
     rng, machine, natural = np.random.default_rng(9), estimator(), list[float]()
-    odd = np.zeros((5, 4))
-    odd[0] = np.radians([20.0, 20.0, 0.0, 40.0])
-    odd[1:, 0] = np.radians([-18.0, 15.0, -15.0, 18.0])
-    odd[1:, 1] = np.radians([0.0, 60.0, 0.0, 70.0])
-    odd[[2, 4], 2:] = np.radians([20.0, 40.0 / 3])
+    unnatural = np.zeros((5, 4))
+    unnatural[0] = np.radians([20.0, 20.0, 0.0, 40.0])
+    unnatural[1:, 0] = np.radians([-18.0, 15.0, -15.0, 18.0])
+    unnatural[1:, 1] = np.radians([0.0, 60.0, 0.0, 70.0])
+    unnatural[[2, 4], 2:] = np.radians([20.0, 40.0 / 3])
     for k in range(240):
-        truth = odd if 60 <= k < 150 else natural_angles(np.random.default_rng(3))
+        truth = unnatural if 60 <= k < 150 else natural_angles(np.random.default_rng(3))
         points = places(palm(), truth) + rng.normal(0.0, 0.5 * SIGMA_M, (6, 3))
         natural.append(found(push(machine, k * STEP_NS, points, COV).solution).natural_weight)
     assert natural[59] > 0.8
@@ -161,7 +162,7 @@ def test_what_both_hypotheses_have_between_them_is_uncertainty_as_well() -> None
 
 @pytest.mark.parametrize(("spread_deg", "free"), [(0.0, False), (5.0, False), (0.0, True)])
 def test_the_dip_follows_exactly_loosely_or_not_at_all(spread_deg: float, free: bool) -> None:
-    """A finger tip 8 degrees off the ratio, on a palm whose orientation is known, so that it can be told."""
+    """A finger tip 8 degrees off the ratio, on a palm whose orientation is known, so that it shows."""
     keys: dict[str, object] = (
         {"dip_per_pip": None} if free else {"dip_spread_rad": float(np.radians(spread_deg))}
     )
@@ -180,7 +181,7 @@ def test_the_dip_follows_exactly_loosely_or_not_at_all(spread_deg: float, free: 
         assert growth[1] > np.abs(growth[[0, 2, 3]]).max()
 
 
-def test_neighbours_can_be_strangers() -> None:
+def test_neighbours_can_be_independent() -> None:
     """The middle finger has no marker and its neighbours show: it bends as they do, or as it likes."""
     truth = np.zeros((5, 4))
     truth[1:, 1], truth[1:, 2], truth[1:, 3] = 0.49, 0.9, 0.6
@@ -276,7 +277,7 @@ def test_a_measured_orientation_turns_the_palm() -> None:
 
 
 def test_an_axis_about_which_nothing_is_known_is_left_to_the_markers() -> None:
-    """Heading 150 degrees off and claimed as unknown: the inclination is used, the heading is not believed."""
+    """Heading 150 degrees off and claimed as unknown: the inclination is used, the heading is not used."""
     up = np.array([0.0, -1.0, 0.0])
     rng = np.random.default_rng(10)
     sigma = np.radians(1.0)
@@ -304,7 +305,7 @@ def test_one_marker_is_enough_where_the_orientation_is_known() -> None:
 
 
 def test_a_palm_turns_with_the_imu_between_frames() -> None:
-    """The last palm is turned by what the IMU says that it has turned since, before it is believed."""
+    """The last palm is turned by what the IMU says that it has turned since, before it is a prior."""
     truth, machine = np.zeros((5, 4)), estimator()
     wide = np.radians(8.0) ** 2 * np.eye(3)
     for k in range(30):

@@ -7,10 +7,10 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.geometry.transforms import rotation_vector_to_matrix
 from common.hand.model import CHAINS, TIPS, WRIST, HandModel
-from common.records import boxed
+from common.records import boxed, record
 from master.estimator.covariance import CovarianceScratch
 from master.estimator.epoch import FittedHand
-from master.estimator.kinematics import BodyPoints, Scratch
+from master.estimator.kinematics import Scratch
 from master.estimator.parameters import HandParameters, HandTables, Mounts
 from master.estimator.posterior import Model
 from master.estimator.sensors import CameraArrays, Device
@@ -39,14 +39,12 @@ def covariances(hand: FittedHand, cov: Float, seen: Bool, model: HandModel = RIG
         boxed(DEFAULT.record()),
         Mounts.of(model, MARKERS),
         CameraArrays.of(PAIR),
-        boxed(Device.none()),
+        boxed(record(Device)),
     )
     straight, whole = np.empty((26, 3, 3)), np.empty((26, 3, 3))
-    storage, information = (
-        CovarianceScratch.empty(len(cov), 16),
-        np.asarray(np.linalg.inv(small_cov()), np.float64),
-    )
-    T, work = hand.T_rig_palm, boxed(Scratch.empty())
+    storage = record(CovarianceScratch, N=len(cov), M=16)
+    information = np.asarray(np.linalg.inv(small_cov()), np.float64)
+    T, work = hand.T_rig_palm, boxed(record(Scratch))
     joint_covariances(rig, T, hand.x, cov, seen, information, work, boxed(storage), straight, whole)
     return straight, whole
 
@@ -62,7 +60,7 @@ def drawn(hand: FittedHand, step: Float, model: HandModel = RIGHT) -> Float:
     parameters = HandParameters.of(model)
     angles = parameters.angles(hand.x + step[:, 6:])
     R = rotation_vector_to_matrix(step[:, :3]) @ hand.T_rig_palm[:3, :3]
-    local = BodyPoints.joints(model, parameters).place(model.chains(angles))
+    local = model.forward(np.eye(4), angles).position_m
     return local @ np.swapaxes(R, 1, 2) + (hand.T_rig_palm[:3, 3] + step[:, 3:6])[:, None]
 
 

@@ -1,12 +1,14 @@
 """The estimator's settings: what is out of range, or is none, is refused by name."""
 
+from dataclasses import astuple
+
 import pytest
 
 from common.errors import CalibrationError
 from master.estimator.settings import DEFAULT, Settings
 
 
-@pytest.mark.parametrize("name", Settings._fields)
+@pytest.mark.parametrize("name", Settings.ranges())
 def test_every_setting_has_a_range_that_holds_its_own_value_and_refuses_others(name: str) -> None:
     allowed = Settings.ranges()[name]
     assert allowed.low <= getattr(DEFAULT, name) <= allowed.high
@@ -28,4 +30,4 @@ def test_a_setting_that_does_not_exist_is_refused() -> None:
 
 
 def test_kernels_are_given_the_same_numbers() -> None:
-    assert [float(getattr(DEFAULT.record(), name)) for name in Settings._fields] == list(DEFAULT)
+    assert [float(getattr(DEFAULT.record(), name)) for name in Settings.ranges()] == list(astuple(DEFAULT))

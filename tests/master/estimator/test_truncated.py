@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from scipy.stats import truncnorm
 
 from common.arrays import Float
-from common.records import boxed
+from common.records import boxed, record
 from master.estimator.parameters import Cut, HandTables
 from tests.hand_helpers import RIGHT
 from tests.master.estimator.fitted import FREE, PARAMETERS
@@ -23,7 +23,7 @@ def truncated_mean(
     """The step (22,) to the mean of a hand with those limits; `at_low_limit`: its fingers rest at their low ones."""
     tables, mean = HandTables.of(RIGHT, PARAMETERS), np.empty(SIZE)
     tables.low[:], tables.high[:], tables.at_low_limit[:] = low, high, at_low_limit
-    truncated_mean_at(boxed(tables), normal, gradient, x, boxed(Cut.empty(FREE, SIZE)), mean)
+    truncated_mean_at(boxed(tables), normal, gradient, x, boxed(record(Cut, n=FREE, N=SIZE)), mean)
     return mean
 
 

@@ -180,7 +180,7 @@ def test_a_missing_tip_falls_back_or_is_left_out(wrist_case: WristCase) -> None:
     np.testing.assert_array_equal(auto.solver_mode == SolverMode.IK, tips)
     assert auto.solver_mode[1] == SolverMode.FK
     assert auto.valid[CHAINS[1]].all()
-    assert not auto.tracked[CHAINS[1, 1:]].any()  # habit has its tip in sight, and the others show theirs
+    assert not auto.tracked[CHAINS[1, 1:]].any()  # the prior has its tip in sight, and the others show theirs
     assert alone.solver_mode[1] == SolverMode.NONE
     assert alone.source[CHAINS[1, 1]] == Source.NONE
     assert np.isnan(alone.angles_rad[1]).all()
@@ -239,7 +239,7 @@ def test_of_two_equal_solutions_the_covariance_holds_both(wrist_case: WristCase)
 
 
 def test_one_hand_against_the_posture_prior_shifts_the_learnt_coupling_of_fk(wrist_case: WristCase) -> None:
-    """Knuckles alone are bent: the finger whose tip is not seen is told by neither curve nor tip."""
+    """Knuckles alone are bent: the finger whose tip is not seen is determined by neither curve nor tip."""
     angles = bent(80.0, 2.0)
     pose, by_prior = (
         Line(wrist_case, solver_mode).sees(angles, tips=np.arange(5) != 2) for solver_mode in ("auto", "fk")
@@ -263,7 +263,7 @@ def test_the_cubic_is_a_preset(wrist_case: WristCase) -> None:
 
 
 def light(line: Line) -> tuple[float, float]:
-    """The unit of light as it is believed: its logarithm and standard deviation."""
+    """The unit of light as it is estimated: its logarithm and standard deviation."""
     estimator = line.pipeline._estimator
     return float(estimator.extras[LED_SCALE]), float(np.sqrt(estimator.extras_cov[LED_SCALE, LED_SCALE]))
 
@@ -376,7 +376,7 @@ def test_a_lost_finger_is_held_for_half_a_second_with_growing_covariance(wrist_c
     assert (np.diff(variance_m2[1:]) > 0.0).all()
     assert (
         variance_m2[1] > 0.95 * variance_m2[0]
-    )  # habits hold the first of them as they did while it was seen
+    )  # priors hold the first of them as they did while it was seen
     line.t_ns += 3 * CYCLE_NS
     gone = line.takes(laser)
     assert not gone.valid[CHAINS[1]].any()
@@ -473,7 +473,7 @@ def test_what_an_imu_says_that_nobody_mounted_is_counted_and_turns_no_palm(wrist
 def test_nineteen_of_twenty_joints_lie_in_their_regions(
     wrist_case: WristCase, solver_mode: Literal["fk", "auto"]
 ) -> None:
-    """Of hands that stray from habits and whose skin differs as much as is believed; at auto all of them do."""
+    """Of hands that stray from the prior and whose skin differs as much as is assumed; at auto all of them do."""
     line, rng, inside = Line(wrist_case, solver_mode), np.random.default_rng(12), list[bool]()
     thick = PalmarSurface.of(wrist_case.setup.model)
     for _ in range(150):

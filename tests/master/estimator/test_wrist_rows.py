@@ -27,7 +27,7 @@ def wrist_case(root: Path) -> WristCase:
 
 
 def hand(wrist_case: WristCase, seed: int) -> tuple[Whole, Seen]:
-    """One before the device, of which nothing is believed, and what is seen of it."""
+    """One before the device, without priors, and what is seen of it."""
     whole = Whole(wrist_case.model, seed, wrist_case.device)
     silent(whole)
     whole.z[:5], whole.z[WRIST_ANGLES : WRIST_ANGLES + 2] = whole.rng.normal(0.0, 0.05, 5), FLEXED
@@ -108,7 +108,9 @@ def test_the_laser_row_is_that_of_closed_form_and_lack(wrist_case: WristCase) ->
         whole, seen = hand(wrist_case, seed)
         laser(whole, seen, 0.3)
         lines_of_sight, n = whole.epoch_prior.lines_of_sight, whole.n
-        by_free = whole.parameters.by_angles(whole.x).reshape(5, 4, n)
+        by_free = whole.parameters.by_parameters(whole.parameters.complete[:, None].copy(), whole.x).reshape(
+            5, 4, n
+        )
         expected, cost = np.zeros(6 + n + len(whole.z)), 0.0
         for f in range(5):
             r = seen.predicted_laser[f] + lines_of_sight.lack[f] - lines_of_sight.laser[f]
@@ -151,7 +153,7 @@ def test_rows_that_are_not_seen_say_nothing(wrist_case: WristCase) -> None:
 def test_a_finger_constrains_its_own_angles_and_twist_and_the_wrist_angles(
     wrist_case: WristCase, teaches: bool
 ) -> None:
-    """One that is in doubt teaches nothing of its hinges."""
+    """One that is ambiguous teaches nothing of its hinges."""
     whole, seen = hand(wrist_case, 2)
     tip_depth(whole, seen, 0.3)
     laser(whole, seen, 0.3)

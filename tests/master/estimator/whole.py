@@ -1,4 +1,4 @@
-"""A hand of which tests say what is believed and measured, and its normal equations against finite differences."""
+"""A hand whose priors and measurements tests set, and its normal equations against finite differences."""
 
 from dataclasses import replace
 
@@ -11,11 +11,11 @@ from common.geometry.transforms import rigid, rotation_vector_to_matrix
 from common.hand.model import HandModel
 from common.hand.profiles import generated_profile, preset_couplings
 from common.kernels import constant
-from common.records import boxed
+from common.records import boxed, filled, record
 from master.estimator.parameters import HandParameters, HandTables, Mounts
 from master.estimator.posterior import Model
 from master.estimator.priors import posture_prior_of
-from master.estimator.problem import EpochPrior, Observations, Search
+from master.estimator.problem import EpochPrior, Iterate, Observations, Search
 from master.estimator.sensors import EXTRAS, NO_EXTRAS, CameraArrays, Device
 from master.estimator.settings import DEFAULT
 from tests.hand_helpers import MARKERS, natural_angles, palm, walls
@@ -42,7 +42,7 @@ MODELS = {
 
 
 class Whole:
-    """A hand somewhere, of which nothing is believed or measured until it is said."""
+    """A hand somewhere, without priors and measurements until they are set."""
 
     def __init__(self, model: HandModel, seed: int, device: Device | None = None) -> None:
         self.model, self.rng, self.h = model, np.random.default_rng(seed), constant(seed % 2)
@@ -55,14 +55,18 @@ class Whole:
         self.z = np.zeros(K)
         self.points = model.marker_points(model.forward(self.T, self.parameters.angles(self.x)), MARKERS)
         self.posture_prior = posture_prior_of(model, self.parameters)
-        self.epoch_prior, self.search = EpochPrior.none(n, K), Search.empty(n, K, 16)
+        self.epoch_prior, self.search = (
+            record(EpochPrior, n=n, K=K),
+            record(Search, n=n, K=K, N=6 + n + K, M=16),
+        )
+        self.search.wrist_share[0] = 1.0
         self.observed = Observations.empty(2, 6)
         self.rig = Model(
             boxed(HandTables.of(model, self.parameters)),
             boxed(DEFAULT.record()),
             Mounts.of(model, MARKERS),
             CameraArrays.of(CAMERAS),
-            boxed(Device.none() if device is None else device),
+            boxed(record(Device) if device is None else device),
         )
 
     def cost(self, step: Float | None = None) -> tuple[float, Float, Float]:
@@ -70,12 +74,17 @@ class Whole:
         N = 6 + self.n + len(self.z)
         by = np.zeros(N) if step is None else step
         T = rigid(rotation_vector_to_matrix(by[:3]) @ self.T[:3, :3], self.T[:3, 3] + by[3:6])
-        gradient, normal = np.empty(N), np.empty((N, N))
+        at = filled(
+            record(Iterate, n=self.n, K=len(self.z), N=N),
+            palm=T,
+            x=self.x + by[6 : 6 + self.n],
+            z=self.z + by[6 + self.n :],
+        )
+        boxes = boxed(at), boxed(self.search)
         cost = linearise_at(
-            self.rig, self.posture_prior, boxed(self.epoch_prior), self.observed, self.h, T,
-            self.x + by[6 : 6 + self.n], self.z + by[6 + self.n :], gradient, normal, boxed(self.search),
-        )  # fmt: skip
-        return float(cost), gradient, normal
+            self.rig, self.posture_prior, boxed(self.epoch_prior), self.observed, self.h, *boxes
+        )
+        return float(cost), at.gradient.copy(), at.normal.copy()
 
     def numeric_gradient(self, step_size: float = H) -> Float:
         """The gradient (N,) by central differences."""
@@ -102,6 +111,6 @@ class Whole:
 
 
 def silent(whole: Whole) -> None:
-    """Let habits say nothing."""
+    """Switch the posture prior off."""
     for table in whole.posture_prior:
         table[:] = 0.0

@@ -10,7 +10,7 @@ from common.arrays import Bool, Float
 from common.hand.model import CHAINS
 from common.hand.wrist import STRAIGHT
 from common.messages import HandPose, WristDetections
-from common.records import boxed
+from common.records import boxed, record
 from master.estimator.finger_surface import Surface
 from master.estimator.parameters import HandParameters, HandTables
 from master.estimator.priors import WristModel, loosened
@@ -67,7 +67,7 @@ class WristCase:
 
     def looks(self, angles: Float, wrist_angles: Float = STRAIGHT, twist: Float = NO_TWIST) -> Seen:
         """What is seen of angles (5, 4) [rad], at a bend (2,) and with hinges rolled by (5,) [rad]."""
-        work, flat = Surface.empty(), np.ascontiguousarray(angles).reshape(20)
+        work, flat = record(Surface), np.ascontiguousarray(angles).reshape(20)
         laser, predicted_laser, tip = (np.full((5, 2), np.nan) for _ in range(3))
         length, depth, by, stretch = np.zeros(5), np.zeros(5), np.zeros((5, 5, 7)), np.zeros(5)
         for f in range(5):

@@ -82,7 +82,7 @@ def test_what_is_held_is_not_scored_and_is_missing() -> None:
     true = truth()
     held = poses(true.t_ns, moved(true.T_rig_object, np.array([1.0, 0.0, 0.0]), np.eye(3)), tracked=False)
     assert score_object(held, true) == {"poses": 11.0, "tracked": 0.0}
-    none = ObjectPoses.of("cube", [])
+    none = ObjectPoses.stacked([], object="cube")
     assert score_object(none, true) == {"poses": 0.0, "tracked": 0.0}
     half = poses(true.t_ns[:5], true.T_rig_object[:5])
     assert tracked_share(half, true) == pytest.approx(5 / 11)

@@ -12,8 +12,8 @@ from common.recording.frame_recording import Illumination
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from master.evaluation.report import Played, forearm_tilt, laser_scores, lit_view, report_scene
-from master.outputs.poses import save_poses
 from master.rig.setup import RigSetup, load_setups
+from tests.master.outputs.test_outputs_files import write
 from tests.master.outputs.test_outputs_rerun import rows_of
 from tests.wrist_run import CYCLE_NS, START_NS, true_poses, wrist_scene, wrist_setup
 
@@ -55,7 +55,7 @@ def test_a_run_is_scored_at_the_times_of_its_poses(
     setup: RigSetup, scene: WristScene, tmp_path: Path, late_ms: int
 ) -> None:
     poses = true_poses(setup, [scene.truth(k * CYCLE_NS * 1e-9 + 1.5) for k in range(N)])
-    save_poses(tmp_path / "poses.npz", poses)
+    write(tmp_path / "poses.npz", poses.messages(), 0)
     epoch_ns = START_NS - 1_500_000_000 - late_ms * 1_000_000
     measured: list[str] = []
     full = report_scene(
@@ -85,7 +85,7 @@ def test_a_run_is_scored_at_the_times_of_its_poses(
 
 def test_a_run_without_a_pose_keeps_its_figures(setup: RigSetup, scene: WristScene, tmp_path: Path) -> None:
     poses = true_poses(setup, [scene.truth(0.0)])
-    save_poses(tmp_path / "poses.npz", poses)
+    write(tmp_path / "poses.npz", poses.messages(), 0)
     after_ns = START_NS + 1
     full = report_scene(
         tmp_path / "poses.npz",

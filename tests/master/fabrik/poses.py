@@ -26,10 +26,10 @@ def _fingers() -> list[list[float]]:
     model, rng, found = HandModel.of(generated_profile("made", "left")), np.random.default_rng(8), []
     for k, name in enumerate(FINGERS):
         finger = Finger.of(model, k, model.mounts[name].offset_m)
-        low, high = np.array(finger.closed_form.limits).T
+        low, high = finger.chain.spans.T
         for spread in _SPREAD_M:
             a, f, pip, dip = (low + rng.uniform(0.1, 0.9, 4) * (high - low)).tolist()
-            target = np.array(finger.closed_form.forward((a, f, pip, dip))) + rng.normal(0.0, spread, 3)
+            target = np.array(finger.forward((a, f, pip, dip))) + rng.normal(0.0, spread, 3)
             for start in (np.full(4, np.nan), np.array([0.0, 0.4, 0.5, 0.3])):
                 residual, iterations, reached = finger.solve(target, start)
                 found.append([*start.tolist(), residual, iterations, float(reached)])
@@ -46,9 +46,9 @@ def _chains() -> list[list[float]]:
     chain, rng, found = Chain(links), np.random.default_rng(3), []
     fabrik = Fabrik.of(chain, 1e-4, max_iterations=10)
     for _ in range(4):
-        pose = chain.clamp(chain.pose(rng.uniform(-0.6, 0.9, 6)))
+        pose = chain.clamp(rng.uniform(-0.6, 0.9, 6))
         result = fabrik.solve(as_vector(chain.forward(pose)[0][-1]))
-        found.append([*chain.flat(result.angles).tolist(), result.residual_m, result.iterations])
+        found.append([*result.angles.tolist(), result.residual_m, result.iterations])
     return found
 
 

@@ -210,7 +210,7 @@ def test_a_flat_marker_is_uncertain_where_another_camera_sees_much_more_of_it() 
     alike = hidden_px(np.stack([whole, 0.7 * whole]), points, nothing)
     np.testing.assert_array_equal(
         alike[:, 5], 0.0
-    )  # side by side: all of a pair's sightings stay as they are
+    )  # side by side: all of a pair's observations stay as they are
     aslant = hidden_px(np.stack([whole, 0.2 * whole]), points, nothing)
     np.testing.assert_allclose(aslant[:, 5], [0.0, 0.8 * 0.5 * np.sqrt(500.0)])
     alone = hidden_px(np.stack([np.full(6, np.nan), 0.2 * whole]), points, nothing)

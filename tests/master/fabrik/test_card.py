@@ -1,4 +1,4 @@
-"""The card's line in the path of every pose: the shipped rig, spied on; and what it is worth to the estimator."""
+"""The card's line in the path of every pose: the shipped rig, spied on; and what the estimator gains by it."""
 
 from collections import Counter
 from collections.abc import Callable

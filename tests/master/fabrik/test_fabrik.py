@@ -10,10 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from common.arrays import Float
 from common.hand.model import FINGERS, HandModel
 from common.hand.profiles import generated_profile, preset_couplings, preset_limits
 from master.fabrik.fabrik import Chain, ChainResult, Coupling, Fabrik, Link, Reach, least_root_to_end
-from master.fabrik.joints import Angles, Hinge, Rotor
+from master.fabrik.joints import Hinge, Rotor, abduction_span, rotation
 from master.fabrik.linear_algebra import (
     IDENTITY,
     Vector,
@@ -24,18 +25,18 @@ from master.fabrik.linear_algebra import (
     rotate_back,
     rotation_about,
 )
-from master.fabrik.solver import FingerSolver, finger_chain
+from master.fabrik.solver import Finger, finger_chain
 
 Preset = Literal["K", "D"]
 
 
 @cache
-def _finger(side: str, preset: Preset, finger: int) -> tuple[Fabrik, FingerSolver]:
+def _finger(side: str, preset: Preset, finger: int) -> tuple[Fabrik, Finger]:
     profile = msgspec.structs.replace(
         generated_profile("made", side), limits_rad=preset_limits(preset), couplings=preset_couplings(preset)
     )
     model = HandModel.of(profile)
-    solver = FingerSolver.of(model, finger, model.mounts[FINGERS[finger]].offset_m)
+    solver = Finger.of(model, finger, model.mounts[FINGERS[finger]].offset_m)
     return Fabrik.of(solver.chain), solver
 
 
@@ -49,29 +50,27 @@ def _narrowing(finger: int, left: float, coupled: bool) -> Fabrik:
     return Fabrik.of(finger_chain(model, finger, np.zeros(3), coupled=coupled))
 
 
-def _with_initial(fabrik: Fabrik, closed_form: FingerSolver, target: Vector) -> ChainResult:
+def _with_initial(fabrik: Fabrik, closed_form: Finger, target: Vector) -> ChainResult:
     """FABRIK from the closed form's pose; target in the palm frame [m]."""
-    a, f, pip, dip, _, _ = closed_form.solve(target)
-    return fabrik.solve(target, ((a, f), (pip,), (dip,)), closed_form.root)
+    return fabrik.solve(target, np.array(closed_form.closed_form(target)[:4]), closed_form.root)
 
 
-def _random_target(solver: FingerSolver, rng: np.random.Generator) -> Vector:
+def _random_target(solver: Finger, rng: np.random.Generator) -> Vector:
     """Where the point is at random legal angles, every tenth in a corner."""
     shares = rng.random(4)
     if rng.random() < 0.1:
         shares = np.round(shares)
-    low, high = np.array(solver.limits).T
-    a, f, pip, dip = (low + shares * (high - low)).tolist()
-    (a, f), (pip,), (dip,) = solver.chain.clamp(((a, f), (pip,), (dip,)))
+    low, high = solver.chain.spans.T
+    a, f, pip, dip = solver.chain.clamp(low + shares * (high - low)).tolist()
     return solver.forward((a, f, pip, dip))
 
 
-def _violated(chain: Chain, angles: tuple[Angles, ...]) -> bool:
-    flat = [q for joint in angles for q in joint]
+def _violated(chain: Chain, angles: Float) -> bool:
+    flat = angles.tolist()
     outside = any(not low <= q <= high for q, (low, high) in zip(flat, chain.spans, strict=True))
     root = chain.links[0].joint
     if isinstance(root, Rotor):  # the parabola, written out once more
-        a, f = angles[0]
+        a, f = flat[:2]
         left = 1.0 - (1.0 - root.spread_at_full_flexion) * (max(f, 0.0) / root.flexion_rad[1]) ** 2
         outside |= not left * root.abduction_rad[0] - 1e-15 <= a <= left * root.abduction_rad[1] + 1e-15
     c = chain.coupling
@@ -99,7 +98,7 @@ def test_ten_thousand_reachable_targets(side: str, preset: Preset) -> None:
         result = _with_initial(fabrik, closed_form, target)
         miss = math.dist(result.positions[-1], target)
         missed += not miss < 1e-4
-        undefined += not math.isfinite(sum(q for joint in result.angles for q in joint) + miss)
+        undefined += not math.isfinite(result.angles.sum() + miss)
         violated += _violated(fabrik.chain, result.angles)
         flagged += not result.reached or result.reach is not Reach.WITHIN
     assert (missed, violated, undefined, flagged) == (0, 0, 0, 0)
@@ -133,7 +132,7 @@ def test_whatever_flexion_leaves_of_the_abduction_is_kept(
     finger: int, left: float, local: Vector, coupled: bool, with_initial: bool
 ) -> None:
     fabrik = _narrowing(finger, left, coupled)
-    seed = ((0.3, 1.5), (0.5,), (0.4,)) if with_initial else None  # itself outside
+    seed = np.array([0.3, 1.5, 0.5, 0.4]) if with_initial else None  # itself outside
     result = fabrik.solve(local, seed)
     assert not _violated(fabrik.chain, result.angles)
     assert result.residual_m == pytest.approx(math.dist(result.positions[-1], local), abs=1e-12)
@@ -142,10 +141,10 @@ def test_whatever_flexion_leaves_of_the_abduction_is_kept(
 def test_the_limit_test_sees_a_planted_violation() -> None:
     chain = _narrowing(1, 0.2, True).chain
     low, high = chain.spans[0]
-    assert not _violated(chain, ((high, 0.0), (0.3,), (0.2,)))
-    assert _violated(chain, ((high, 1.0), (0.3,), (0.2,)))
-    assert _violated(chain, ((low, 1.0), (0.3,), (0.2,)))
-    assert _violated(chain, ((0.0, 1.0), (0.3,), (0.4,)))  # the coupling
+    assert not _violated(chain, np.array([high, 0.0, 0.3, 0.2]))
+    assert _violated(chain, np.array([high, 1.0, 0.3, 0.2]))
+    assert _violated(chain, np.array([low, 1.0, 0.3, 0.2]))
+    assert _violated(chain, np.array([0.0, 1.0, 0.3, 0.4]))  # the coupling
 
 
 WIDE = Hinge(-2.8, 2.8)
@@ -168,8 +167,8 @@ ARM = Chain(
 def test_iteration_itself_converges_from_a_nearby_pose(
     swing: tuple[float, float], elbow: float, wrist: float, off: tuple[float, float]
 ) -> None:
-    target = as_vector(ARM.forward((swing, (elbow,), (wrist,)))[0][-1])
-    seed = ((swing[0] + off[0], swing[1] + off[1]), (elbow + off[0],), (wrist + off[1],))
+    pose = np.array([*swing, elbow, wrist])
+    target, seed = as_vector(ARM.forward(pose)[0][-1]), np.add(pose, [*off, *off])
     result = Fabrik.of(ARM, 1e-4, 200, restarts=0).solve(target, seed)
     assert math.dist(result.positions[-1], target) < 1e-4 + 1e-12
     assert result.reached
@@ -188,17 +187,11 @@ def test_rotor_in_the_middle_and_world_hinge_obey_their_limits() -> None:
     fabrik = Fabrik.of(chain, 1e-4)
     reached = 0
     for _ in range(40):
-        legal = chain.clamp(
-            (
-                tuple(rng.uniform(-1, 1, 2).tolist()),
-                tuple(rng.uniform(-0.5, 0.9, 2).tolist()),
-                (float(rng.uniform(-0.6, 0.6)),),
-            )
-        )
+        legal = chain.clamp(rng.uniform([-1.0, -1.0, -0.5, -0.5, -0.6], [1.0, 1.0, 0.9, 0.9, 0.6]))
         result = fabrik.solve(as_vector(chain.forward(legal)[0][-1]))
         reached += result.residual_m < 2e-3
         legal = chain.clamp(result.angles)
-        assert np.concatenate(legal) == pytest.approx(np.concatenate(result.angles), abs=1e-9)
+        assert legal == pytest.approx(result.angles, abs=1e-9)
         assert _consistent(chain, result, (0.0, 0.0, 0.0))
         # the world hinge keeps its bone level whatever carries it
         assert abs(result.positions[3][1] - result.positions[2][1]) < 1e-12
@@ -217,11 +210,11 @@ def test_a_narrowing_rotor_in_the_middle_and_a_world_rotor_obey_their_limits() -
     fabrik = Fabrik.of(chain, 1e-4)
     reached = 0
     for _ in range(60):
-        legal = chain.clamp(tuple((float(a), float(f)) for a, f in rng.uniform(-1.0, 1.2, (3, 2))))
+        legal = chain.clamp(rng.uniform(-1.0, 1.2, 6))
         result = fabrik.solve(as_vector(chain.forward(legal)[0][-1]))
         reached += result.reached
-        for (a, f), rotor in zip(result.angles[1:], (narrow, upright), strict=True):
-            low, high = rotor.abduction_span(f)
+        for (a, f), rotor in zip(result.angles.reshape(3, 2)[1:], (narrow, upright), strict=True):
+            low, high = abduction_span(rotor.limits, f)
             assert low <= a <= high
             assert rotor.flexion_rad[0] <= f <= rotor.flexion_rad[1]
         assert _consistent(chain, result, (0.0, 0.0, 0.0))
@@ -249,7 +242,7 @@ def test_no_joint_twists(finger: int, local: Vector, side: str) -> None:
 
 
 def test_the_twist_test_sees_a_planted_twist() -> None:
-    rest = Rotor((-1.0, 1.0), (-1.0, 1.0)).rotation((0.3, 0.4))
+    rest = rotation(Rotor((-1.0, 1.0), (-1.0, 1.0)).limits, (0.3, 0.4))
     twisted = product(rest, rotation_about((0.0, 0.0, 1.0), 0.01))
     assert rest[1][0] == pytest.approx(0.0, abs=1e-12)
     assert abs(twisted[1][0]) > 1e-3
@@ -264,7 +257,7 @@ def test_root_and_frame_only_move_the_answer() -> None:
     moved = rotate(frame, local)
     target = (moved[0] + root[0], moved[1] + root[1], moved[2] + root[2])
     a, b = fabrik.solve(local), fabrik.solve(target, None, root, frame)
-    assert np.array(b.angles[0]) == pytest.approx(np.array(a.angles[0]), abs=1e-6)
+    assert b.angles[:2] == pytest.approx(a.angles[:2], abs=1e-6)
     back = [rotate_back(frame, as_vector(p - root)) for p in b.positions]
     assert np.array(back) == pytest.approx(a.positions, abs=1e-7)
     assert as_vector(b.positions[0]) == root
@@ -275,7 +268,7 @@ def test_too_far_is_stretched_and_flagged() -> None:
     assert fabrik.farthest_m == pytest.approx(sum(fabrik.chain.lengths))
     direction = np.array(closed_form.forward((0.0, 0.4, 0.0, 0.0))) - closed_form.root
     target = tuple((np.array(closed_form.root) + 4 * direction).tolist())
-    for seed in (None, ((0.1, 0.9), (1.0,), (0.6,))):
+    for seed in (None, np.array([0.1, 0.9, 1.0, 0.6])):
         result = fabrik.solve(target, seed, closed_form.root)
         assert result.reach is Reach.TOO_FAR
         assert not result.reached
@@ -332,7 +325,7 @@ def test_not_seen_is_nan_and_says_so() -> None:
         assert result.reach is Reach.NOT_SEEN
         assert not result.reached
         assert np.isnan(result.positions).all()
-        assert [len(joint) for joint in result.angles] == [2, 1, 1]
+        assert result.angles.shape == (4,)
 
 
 def test_a_bone_without_length_is_flagged_and_solved_round() -> None:
@@ -342,7 +335,7 @@ def test_a_bone_without_length_is_flagged_and_solved_round() -> None:
         Link(IDENTITY, Hinge(0.0, 1.5), (0.0, 0.0, -0.02)),
     )
     chain = Chain(links)
-    target = as_vector(chain.forward(((0.2, 0.3), (0.4,), (0.5,)))[0][-1])
+    target = as_vector(chain.forward(np.array([0.2, 0.3, 0.4, 0.5]))[0][-1])
     result = Fabrik.of(chain).solve(target)
     assert result.degenerate
     assert np.isfinite(result.positions).all()
@@ -359,8 +352,8 @@ def test_wrong_chains_and_settings_are_refused() -> None:
         Fabrik.of(Chain((link,)), 0.0)
     with pytest.raises(ValueError, match="0 to 3"):
         Fabrik.of(Chain((link,)), restarts=4)
-    with pytest.raises(ValueError, match="2 angles for a joint that has 1"):
-        Fabrik.of(Chain((link,))).solve((0.0, 0.0, -0.1), ((0.1, 0.2),))
+    with pytest.raises(ValueError, match="2 angles for a chain that has 1"):
+        Fabrik.of(Chain((link,))).solve((0.0, 0.0, -0.1), np.array([0.1, 0.2]))
 
 
 def test_uncoupled_finger_keeps_the_dip_free() -> None:

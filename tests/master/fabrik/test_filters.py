@@ -195,10 +195,8 @@ def test_a_group_has_the_cut_off_of_its_fastest_signal_and_another_its_own() -> 
     rng = np.random.default_rng(3)
     slow, quick = rng.normal(0.0, 1e-3, (2, 120))
     quick += 3.0 * np.arange(120) / 120.0
-    together = OneEuro(OneEuroParameters(1.0, 5.0, 1.0), (2, 1))
-    out = np.array(
-        [together.push(t, np.array([a, b, a])) for t, a, b in zip(times, slow, quick, strict=True)]
-    )
+    grouped = OneEuro(OneEuroParameters(1.0, 5.0, 1.0), (2, 1))
+    out = np.array([grouped.push(t, np.array([a, b, a])) for t, a, b in zip(times, slow, quick, strict=True)])
     alone = [_Reference(1.0, 5.0, 1.0) for _ in range(2)]
     expected = np.array(
         [

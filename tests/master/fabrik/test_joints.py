@@ -10,7 +10,17 @@ from hypothesis import strategies as st
 
 from common.hand.model import HandModel
 from common.hand.profiles import generated_profile, preset_limits
-from master.fabrik.joints import Angles, Hinge, Joint, Rotor, swing_and_flex
+from master.fabrik.joints import (
+    Hinge,
+    Joint,
+    Rotor,
+    abduction_span,
+    clamp,
+    fit,
+    narrowing,
+    rotation,
+    swing_and_flex,
+)
 from master.fabrik.linear_algebra import (
     IDENTITY,
     Matrix,
@@ -52,12 +62,31 @@ def _zero(joint: Joint) -> tuple[float, ...]:
     return ZERO[isinstance(joint, Hinge)]
 
 
+Angles = tuple[float, ...]
+
+
+def _pair(angles: Angles) -> tuple[float, float]:
+    return angles[0], angles[1] if len(angles) > 1 else 0.0
+
+
+def _rotation(joint: Joint, angles: Angles) -> Matrix:
+    return rotation(joint.limits, _pair(angles))
+
+
+def _clamp(joint: Joint, angles: Angles) -> Angles:
+    return clamp(joint.limits, _pair(angles))[: len(angles)]
+
+
+def _fit(joint: Joint, bone: Vector, direction: Vector, now: Angles) -> Angles:
+    return fit(joint.limits, bone, direction, _pair(now))[: len(now)]
+
+
 def clamp_direction(
     joint: Joint, frame: Matrix, bone: Vector, direction: Vector, now: Angles
 ) -> tuple[Vector, Angles]:
     """Legal bone direction nearest to a wanted one (world), and its angles."""
-    angles = joint.fit(bone, rotate_back(frame, direction), now)
-    return rotate(frame, rotate(joint.rotation(angles), bone)), angles
+    angles = _fit(joint, bone, rotate_back(frame, direction), now)
+    return rotate(frame, rotate(_rotation(joint, angles), bone)), angles
 
 
 def _inside(joint: Joint, angles: tuple[float, ...]) -> bool:
@@ -93,10 +122,10 @@ def test_a_legal_direction_is_unchanged(
         legal: tuple[float, ...] = (joint.low_rad + share[0] * (joint.high_rad - joint.low_rad),)
     else:
         f = joint.flexion_rad[0] + share[1] * (joint.flexion_rad[1] - joint.flexion_rad[0])
-        low, high = joint.abduction_span(f)
+        low, high = abduction_span(joint.limits, f)
         legal = (low + share[0] * (high - low), f)
     assert _inside(joint, legal)
-    direction = rotate(frame, rotate(joint.rotation(legal), BONE))
+    direction = rotate(frame, rotate(_rotation(joint, legal), BONE))
     x, y, z = direction
     out, angles = clamp_direction(joint, frame, BONE, (stretch * x, stretch * y, stretch * z), legal)
     assert out == pytest.approx(direction, abs=1e-8)
@@ -112,7 +141,7 @@ def test_a_hinge_gives_the_nearest_direction(joint: Hinge, frame: Matrix, wanted
 
     out, _ = clamp_direction(joint, frame, BONE, wanted, (0.0,))
     grid = np.linspace(joint.low_rad, joint.high_rad, 241)
-    best = max(closeness(rotate(frame, rotate(joint.rotation((float(a),)), BONE))) for a in grid)
+    best = max(closeness(rotate(frame, rotate(_rotation(joint, (float(a),)), BONE))) for a in grid)
     assert closeness(out) >= best - 1e-9
 
 
@@ -132,13 +161,13 @@ def test_flexion_turns_towards_the_palm_and_abduction_to_the_thumb() -> None:
 
 def test_shapes_by_hand() -> None:
     # half-angles 25 and 90 deg: the ellipse leaves 25 * sqrt(1 - 0.5^2) = 21.65 deg at 45 deg
-    assert CONE.abduction_span(45 * DEGREE)[1] / DEGREE == pytest.approx(25 * math.sqrt(0.75))
-    assert CONE.abduction_span(-10 * DEGREE)[0] / DEGREE == pytest.approx(-15 * math.sqrt(0.75))
-    assert CONE.clamp((50 * DEGREE, 0.0))[0] / DEGREE == pytest.approx(25.0)
+    assert abduction_span(CONE.limits, 45 * DEGREE)[1] / DEGREE == pytest.approx(25 * math.sqrt(0.75))
+    assert abduction_span(CONE.limits, -10 * DEGREE)[0] / DEGREE == pytest.approx(-15 * math.sqrt(0.75))
+    assert _clamp(CONE, (50 * DEGREE, 0.0))[0] / DEGREE == pytest.approx(25.0)
     # 45 of 90 deg flexed: a quarter of the 80 % loss
-    assert SHRINKING.abduction_span(45 * DEGREE)[1] / DEGREE == pytest.approx(20 * 0.8)
-    assert BOX.clamp((1.0, 2.0)) == pytest.approx((15 * DEGREE, 90 * DEGREE))
-    assert MIDDLE.clamp((0.2, 0.5)) == (0.0, 0.5)
+    assert abduction_span(SHRINKING.limits, 45 * DEGREE)[1] / DEGREE == pytest.approx(20 * 0.8)
+    assert _clamp(BOX, (1.0, 2.0)) == pytest.approx((15 * DEGREE, 90 * DEGREE))
+    assert _clamp(MIDDLE, (0.2, 0.5)) == (0.0, 0.5)
 
 
 @settings(max_examples=30)
@@ -152,21 +181,21 @@ def test_rotor_and_hand_model_narrow_by_one_law(flexion: float, left: float) -> 
     low, high = model.abduction_limits_rad(np.full(5, flexion))
     root = finger_chain(model, 3, np.zeros(3)).links[0].joint
     assert isinstance(root, Rotor)
-    assert root.abduction_span(flexion) == (low[3], high[3])  # to the last bit
+    assert abduction_span(root.limits, flexion) == (low[3], high[3])  # to the last bit
 
 
 @given(flexion=st.floats(0.01, 1.5), left=st.floats(0.0, 1.0))
 def test_the_derivative_of_the_narrowing(flexion: float, left: float) -> None:
     rotor = Rotor((-0.3, 0.3), (0.0, 1.6), spread_at_full_flexion=left)
     step = 1e-6
-    above, below = rotor.narrowing(flexion + step)[0], rotor.narrowing(flexion - step)[0]
-    assert rotor.narrowing(flexion)[1] == pytest.approx((above - below) / (2 * step), abs=1e-8)
+    above, below = narrowing(rotor.limits, flexion + step)[0], narrowing(rotor.limits, flexion - step)[0]
+    assert narrowing(rotor.limits, flexion)[1] == pytest.approx((above - below) / (2 * step), abs=1e-8)
 
 
 def test_hinge_goes_round_the_shorter_way() -> None:
     hinge = Hinge(-10 * DEGREE, 100 * DEGREE)
-    assert hinge.clamp((-170 * DEGREE,)) == (100 * DEGREE,)  # 90 past one end, 160 past the other
-    assert hinge.clamp((-100 * DEGREE,)) == (-10 * DEGREE,)
+    assert _clamp(hinge, (-170 * DEGREE,)) == (100 * DEGREE,)  # 90 past one end, 160 past the other
+    assert _clamp(hinge, (-100 * DEGREE,)) == (-10 * DEGREE,)
 
 
 @given(
@@ -177,18 +206,18 @@ def test_hinge_goes_round_the_shorter_way() -> None:
 def test_swing_and_flex_inverts_the_rotation(bone: Vector, pair: tuple[float, float], sign: float) -> None:
     assume(math.hypot(bone[1], bone[2]) > 0.05)
     rotor = Rotor((-3.0, 3.0), (-3.0, 3.0), sign=sign, rest=TILTED)
-    target = rotate(rotor.rotation(pair), bone)
+    target = rotate(_rotation(rotor, pair), bone)
     for found in swing_and_flex(bone, target, TILTED, sign):
-        assert rotate(rotor.rotation(found), bone) == pytest.approx(target, abs=1e-6)
+        assert rotate(_rotation(rotor, found), bone) == pytest.approx(target, abs=1e-6)
 
 
 @pytest.mark.parametrize("joint", JOINTS)
 def test_no_direction_keeps_the_present_angles(joint: Joint) -> None:
-    now = joint.clamp((0.1, 0.4)[: len(_zero(joint))])
-    assert joint.fit(BONE, (0.0, 0.0, 0.0), now) == now
-    assert joint.fit((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), now) == now
+    now = _clamp(joint, (0.1, 0.4)[: len(_zero(joint))])
+    assert _fit(joint, BONE, (0.0, 0.0, 0.0), now) == now
+    assert _fit(joint, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), now) == now
     if isinstance(joint, Hinge):
-        assert joint.fit(BONE, joint.axis, now) == now  # on the axis every angle is as good
+        assert _fit(joint, BONE, joint.axis, now) == now  # on the axis every angle is as good
 
 
 def test_impossible_limits_are_refused() -> None:
@@ -215,7 +244,7 @@ def test_a_stiff_knuckle_narrows_as_the_hand_model_has_it(flexion: tuple[float, 
     assert isinstance(root, Rotor)
     for f in flexion:
         low, high = model.abduction_limits_rad(np.full(5, f))
-        assert root.abduction_span(f) == pytest.approx((low[3], high[3]))
+        assert abduction_span(root.limits, f) == pytest.approx((low[3], high[3]))
 
 
 @given(a=directions, b=directions)

@@ -1,4 +1,4 @@
-"""The measured noise of signals: white noise, motion, steps of odd length, and what it may be at most."""
+"""The measured noise of signals: white noise, motion, steps of uneven length, and what it may be at most."""
 
 import numpy as np
 import pytest

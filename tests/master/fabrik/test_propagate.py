@@ -1,4 +1,4 @@
-"""Tracks carried to an instant: motion is followed, noise is not amplified, sigma covers the error.
+"""Tracks carried to an epoch: motion is followed, noise is not amplified, sigma covers the error.
 
 Where a slave named two places, no line leads from one thing to another.
 """
@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[3]
 MS = 1e6
 PX_M = 1000.0
 NOWHERE = np.array([np.nan, np.nan])
-PAST = (5.0, -11.0, -27.0, -43.0)  # [ms] from the instant: one frame after it
+PAST = (5.0, -11.0, -27.0, -43.0)  # [ms] from the epoch: one frame after it
 AHEAD = (-8.0, -24.0, -40.0, -56.0)  # predicted by half a period
 HELD_PX_S = PX_M * np.sqrt(
     (2 * 1.0**2 + 0.01**2) / 3
@@ -34,7 +34,7 @@ REACH_NS = 25_000_000, 80_000_000, 80_000_000, 80_000_000
 
 @dataclass(frozen=True)
 class Frame:
-    """What one camera saw at a time: places (M, 2) [px], those of rivals, sigma [px]."""
+    """What one camera saw at a time: places (M, 2) [px], those of alternatives, sigma [px]."""
 
     t_ms: float
     uv: Float
@@ -94,7 +94,7 @@ def observation(t_ms: float, first: Float, second: Float | None = None) -> Frame
     return Frame(t_ms, np.stack([first, [10.0, 20.0]]), alternatives)
 
 
-def test_without_a_rival_there_are_none() -> None:
+def test_without_an_alternative_there_are_none() -> None:
     found = propagate_one(
         [observation(5, marker(5)), observation(-11, marker(-11)), observation(-27, marker(-27))]
     )
@@ -111,7 +111,7 @@ def test_two_things_that_change_their_roles_keep_their_own_paths(swapped: tuple[
         warm_start.append(observation(t, first(t), second(t)))
     found = propagate_one(warm_start)
     assert found.alt_uv is not None
-    # Which of the two is called the marker is what the nearest sighting says.
+    # Which of the two is called the marker is what the nearest frame names.
     first, second = (mug, marker) if 0 in swapped else (marker, mug)
     np.testing.assert_allclose(found.uv[0], first(0.0), atol=0.02)
     np.testing.assert_allclose(found.alt_uv[0], second(0.0), atol=0.02)
@@ -119,7 +119,7 @@ def test_two_things_that_change_their_roles_keep_their_own_paths(swapped: tuple[
     np.testing.assert_allclose(found.uv[1], [10.0, 20.0])
 
 
-def test_a_rival_seen_in_the_nearest_frame_alone_is_held_there_with_a_larger_sigma() -> None:
+def test_an_alternative_seen_in_the_nearest_frame_alone_is_held_there_with_a_larger_sigma() -> None:
     warm_start = [
         observation(5, marker(5), mug(5)),
         observation(-11, marker(-11)),
@@ -134,7 +134,7 @@ def test_a_rival_seen_in_the_nearest_frame_alone_is_held_there_with_a_larger_sig
     assert found.sigma_px[0] < 0.3
 
 
-def test_a_rival_of_the_oldest_frame_alone_changes_nothing() -> None:
+def test_an_alternative_of_the_oldest_frame_alone_changes_nothing() -> None:
     """The marker moves 9.6 px a frame, and no place of it is given to a track that has not begun."""
     warm_start = [
         observation(5, marker(5)),
@@ -147,7 +147,7 @@ def test_a_rival_of_the_oldest_frame_alone_changes_nothing() -> None:
     np.testing.assert_array_equal(found.sigma_px, clear.sigma_px)
 
 
-def test_a_rival_of_an_older_frame_is_no_rival_now_but_does_not_lead_the_marker_astray() -> None:
+def test_an_alternative_of_an_older_frame_is_no_alternative_now_but_does_not_lead_the_marker_astray() -> None:
     warm_start = [
         observation(5, marker(5)),
         observation(-11, mug(-11), marker(-11)),
@@ -156,7 +156,7 @@ def test_a_rival_of_an_older_frame_is_no_rival_now_but_does_not_lead_the_marker_
     found = propagate_one(warm_start)
     assert found.alt_uv is not None
     assert np.isnan(found.alt_uv[0]).all()
-    # A line through two sightings; the third is the mug.
+    # A line through two observations; the third is the mug.
     np.testing.assert_allclose(found.uv[0], marker(0.0), atol=0.05)
 
 
@@ -168,7 +168,7 @@ def test_what_is_a_leap_away_is_another_thing() -> None:
     assert found.sigma_px[0] == pytest.approx(np.hypot(0.1, HELD_PX_S * 0.005), rel=2e-3)
 
 
-# -- one marker, no doubt who it is ----------------------------------------------------------------------------------
+# -- one marker, no alternative ----------------------------------------------------------------------------------
 
 
 def seen(times_ms: tuple[float, ...], places: Float, sigma_px: float = 0.1) -> list[Frame]:
@@ -184,11 +184,11 @@ def test_without_noise_a_cubic_is_met(times: tuple[float, ...]) -> None:
     found = propagate_one(seen(times, places, sigma_px=1e-3))
     np.testing.assert_allclose(found.uv, [[300.0, 300.0]], atol=0.1)
     straight = propagate_one(seen(times[:2], places[:2], sigma_px=1e-3))
-    assert np.abs(straight.uv - 300.0).max() > 0.15  # two sightings do not know the turn
+    assert np.abs(straight.uv - 300.0).max() > 0.15  # two observations do not know the turn
 
 
 @pytest.mark.parametrize(("times", "most_px"), [(PAST, 0.08), (AHEAD, 0.11)])
-def test_a_marker_at_rest_is_no_less_steady_than_its_sightings(
+def test_a_marker_at_rest_is_no_less_steady_than_its_observations(
     times: tuple[float, ...], most_px: float
 ) -> None:
     rng = np.random.default_rng(2)
@@ -242,7 +242,7 @@ def test_a_time_error_adds_with_the_speed() -> None:
     assert added[1] < 0.01
 
 
-def test_a_jump_farther_than_a_hand_goes_is_another_thing_also_without_a_rival() -> None:
+def test_a_jump_farther_than_a_hand_goes_is_another_thing_also_without_an_alternative() -> None:
     places = np.full((SETTINGS.observations, 1, 2), 300.0)
     jumped = places.copy()
     jumped[1:] += 200.0
@@ -252,7 +252,7 @@ def test_a_jump_farther_than_a_hand_goes_is_another_thing_also_without_a_rival()
     np.testing.assert_allclose(found.sigma_px, held.sigma_px)
 
 
-def test_a_sighting_that_missed_the_marker_leaves_a_gap_and_no_more() -> None:
+def test_an_observation_that_missed_the_marker_leaves_a_gap_and_no_more() -> None:
     t = np.array(PAST)[:, None, None] * 1e-3
     places = 300.0 + t * [600.0, -200.0]
     gap = places.copy()
@@ -272,14 +272,14 @@ def test_cameras_are_carried_each_by_itself() -> None:
     places = 300.0 + rng.normal(0.0, 2.0, (2, SETTINGS.observations, 3, 2))
     views = [seen(PAST, places[0]), seen(AHEAD[:2], places[1][:2]), []]
     scale = np.array([1000.0, 700.0, 900.0])
-    together = carried(history(views, scale))
+    paired = carried(history(views, scale))
     for c in range(2):
         alone = carried(history([views[c]], scale[c : c + 1]))
-        np.testing.assert_allclose(together.uv[c], alone.uv[0])
-        np.testing.assert_allclose(together.sigma_px[c], alone.sigma_px[0])
-    assert np.isnan(together.uv[2]).all()
-    assert np.isnan(together.sigma_px[2]).all()
-    assert together.missing.tolist() == [False, False, True]
+        np.testing.assert_allclose(paired.uv[c], alone.uv[0])
+        np.testing.assert_allclose(paired.sigma_px[c], alone.sigma_px[0])
+    assert np.isnan(paired.uv[2]).all()
+    assert np.isnan(paired.sigma_px[2]).all()
+    assert paired.missing.tolist() == [False, False, True]
 
 
 def by_formula(t_s: Float, y: Float, sigma: Float) -> tuple[Float, float]:
@@ -331,7 +331,7 @@ def test_frames_seldom_taken_give_a_finite_place_with_a_wide_sigma(period_s: flo
 
 
 def examples() -> list[list[float]]:
-    """Places and sigmas of three cameras, with rivals, gaps and rows at their own times."""
+    """Places and sigmas of three cameras, with alternatives, gaps and rows at their own times."""
     rng, found = np.random.default_rng(5), list[list[float]]()
     for _ in range(40):
         views = list[list[Frame]]()
@@ -371,6 +371,6 @@ def test_plain_python_finds_the_same() -> None:
     assert was_plain
     assert not plain()
     compiled = examples()
-    assert sum(len(one) for one in compiled[2::4]) > 500  # rivals were compared
+    assert sum(len(one) for one in compiled[2::4]) > 500  # alternatives were compared
     for one, other in zip(there, compiled, strict=True):
         assert one == pytest.approx(other, abs=1e-9, nan_ok=True)

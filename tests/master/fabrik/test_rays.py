@@ -286,6 +286,6 @@ def test_plain_python_finds_the_same_points() -> None:
     assert not compiled["plain"]
     found = compiled["found"]
     assert isinstance(found, list)
-    assert sum(found[4]) == 1.0  # the knocked sighting
+    assert sum(found[4]) == 1.0  # the knocked camera
     for one, other in zip(plain["found"], found, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)

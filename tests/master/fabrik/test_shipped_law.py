@@ -51,7 +51,7 @@ def _seen(setup: RigSetup, rng: np.random.Generator, sigma_px: float) -> tuple[F
 
 
 def _by_law(setup: RigSetup, uv: Float) -> Float:
-    """Points (N, 3) [m], as many at once as the rig has markers, which nothing tells the direction of."""
+    """Points (N, 3) [m], as many at once as the rig has markers, of no known direction."""
     rig, cameras = setup.rig, tuple(setup.models.values())
     law = depth_law(rig, cameras)
     assert law is not None

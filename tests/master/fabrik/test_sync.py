@@ -1,4 +1,4 @@
-"""Frame synchronisation: which instants come out, when, in any order of messages, and where each marker was."""
+"""Frame synchronisation: which epochs come out, when, in any order of messages, and where each marker was."""
 
 import msgspec
 import numpy as np
@@ -59,10 +59,10 @@ def stream(camera: str, count: int, late_ns: int = 0, row_time_us: float = 0.0) 
     return [frame(camera, k, k * PERIOD + late_ns, row_time_us=row_time_us) for k in range(count)]
 
 
-# -- when an instant comes out -----------------------------------------------------------------------------------
+# -- when an epoch comes out -----------------------------------------------------------------------------------
 
 
-def test_an_instant_waits_for_the_other_camera_and_no_longer() -> None:
+def test_an_epoch_waits_for_the_other_camera_and_no_longer() -> None:
     machine = sync()
     for k in range(2):
         machine.push(frame("left", k, k * PERIOD))
@@ -116,7 +116,7 @@ def test_predicted_tracks_follow_the_motion() -> None:
 @pytest.mark.parametrize(("policy", "late_ms"), [("interpolate", 5), ("predict", 5)])
 @given(st.lists(st.booleans(), min_size=60, max_size=60))
 @settings(max_examples=30)
-def test_any_order_of_the_two_cameras_messages_gives_the_same_instants(
+def test_any_order_of_the_two_cameras_messages_gives_the_same_epochs(
     policy: str, late_ms: int, choices: list[bool]
 ) -> None:
     streams = stream("left", 20, row_time_us=20.0), stream("right", 20, late_ms * MS, row_time_us=20.0)
@@ -157,12 +157,12 @@ def test_a_parabola_is_met_exactly_whatever_the_capture_times(late_ms: float, ro
     for k, epoch in enumerate(epochs):
         assert epoch.t_ns == k * PERIOD + round(239.5 * row_time_us * 1e3)  # the centre row of the leader
         if k < 2:
-            continue  # the first two have no three sightings
+            continue  # the first two have no three observations
         truth = path(np.array(epoch.t_ns * 1e-9))
         np.testing.assert_allclose(epoch.uv, [truth, truth], atol=0.05)  # half of a centroid's noise
 
 
-def test_a_single_sighting_is_held_and_its_sigma_is_a_hand_speed_times_the_time() -> None:
+def test_a_single_observation_is_held_and_its_sigma_is_a_hand_speed_times_the_time() -> None:
     machine = sync()
     machine.push(frame("left", 0, 0))
     machine.push(frame("right", 0, 4 * MS))
@@ -188,12 +188,12 @@ def test_a_lost_marker_stays_lost_and_leaves_the_other_alone() -> None:
     for k in range(10):
         np.testing.assert_array_equal(found[k].uv[:, 1], whole[k].uv[:, 1])
         np.testing.assert_array_equal(found[k].uv[0], whole[k].uv[0])
-    # Nearest to an instant is the right frame 5 ms after it; where that has no marker there is none.
+    # Nearest to an epoch is the right frame 5 ms after it; where that has no marker there is none.
     assert [bool(np.isnan(i.uv[1, 0]).all()) for i in found] == [4 <= k < 7 for k in range(10)]
 
 
-def test_a_rival_is_carried_at_the_time_of_its_own_row() -> None:
-    """The second marker's path is the rival of the first; the right slave names them crosswise now and then."""
+def test_an_alternative_is_carried_at_the_time_of_its_own_row() -> None:
+    """The second marker's path is the alternative of the first; the right slave names them crosswise now and then."""
     alone = np.array([[0.0, 0.0], [np.nan, np.nan]])
     streams: list[list[MarkerDetections]] = []
     for camera, late in (("left", 0), ("right", 5 * MS)):
@@ -223,7 +223,7 @@ def test_a_rival_is_carried_at_the_time_of_its_own_row() -> None:
         assert np.isnan(epoch.alt_uv[:, 1]).all()
 
 
-def test_no_rival_costs_nothing_and_makes_none() -> None:
+def test_no_alternative_costs_nothing_and_makes_none() -> None:
     epochs = push_all(sync(), interleaved(stream("left", 4), stream("right", 4, 5 * MS)))
     assert all(epoch.alt_uv is None and epoch.alt_sigma_px is None for epoch in epochs)
 
@@ -250,7 +250,7 @@ def test_when_the_other_camera_falls_silent_poses_go_on() -> None:
     assert all(i.missing[1] for i in epochs[13:])
 
 
-def test_after_the_silence_an_instant_no_longer_waits_for_the_deadline() -> None:
+def test_after_the_silence_an_epoch_no_longer_waits_for_the_deadline() -> None:
     machine = sync()
     for message in interleaved(stream("left", 60), stream("right", 2, 5 * MS)):
         machine.push(message)
@@ -311,7 +311,7 @@ def test_a_whole_pair_before_a_pause_is_solved_whenever_it_is_complete() -> None
     assert machine.stale == 0
 
 
-def test_three_cameras_meet_at_the_instant_of_the_first() -> None:
+def test_three_cameras_meet_at_the_epoch_of_the_first() -> None:
     cameras = ("left", "right", "top")
     streams = [stream(camera, 10, late * MS) for camera, late in zip(cameras, (0, 5, 11), strict=True)]
     epochs = push_all(sync(cameras=cameras), interleaved(*streams))
@@ -336,9 +336,9 @@ def test_unrelated_frames_are_never_mixed() -> None:
     assert list(lonely[0].missing) == [False, True]
 
 
-def test_a_stranger_is_a_mistake_of_the_caller() -> None:
-    with pytest.raises(ValueError, match="stranger"):
-        sync().push(frame("stranger", 0, 0))
+def test_an_unknown_camera_is_a_mistake_of_the_caller() -> None:
+    with pytest.raises(ValueError, match="unknown"):
+        sync().push(frame("unknown", 0, 0))
     with pytest.raises(ValueError, match="'left': 1 markers, not 2"):
         sync().push(detections("left", 0, 0, np.full((1, 2), 100.0)))
 
@@ -356,7 +356,7 @@ def test_what_was_emitted_stays_as_it_was() -> None:
             np.testing.assert_array_equal(array, copy)
 
 
-def test_an_instant_older_than_all_that_is_held_has_no_frame() -> None:
+def test_an_epoch_older_than_all_that_is_held_has_no_frame() -> None:
     machine = sync()
     for k in range(2 * SETTINGS.history):
         machine.push(frame("left", k, k * PERIOD))

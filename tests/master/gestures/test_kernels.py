@@ -13,7 +13,7 @@ import master.gestures
 from common.calibration.gesture_settings import default_gestures
 from common.geometry.transforms import axis_rotation, rigid
 from common.hand.model import CHAINS
-from common.hand.skin import TaperedCapsules, gaps_between
+from common.hand.skin import finger_segments, gaps_between
 from common.messages import HandPose
 from common.sim.gesture_postures import knob_grip, pinch_posture
 from common.sim.motion import POSES, angles_of
@@ -59,8 +59,8 @@ def test_a_covariance_spreads_by_the_roots_of_its_eigenvalues() -> None:
 def test_gaps_of_the_thumb_are_those_between_round_cones(name: str) -> None:
     seen = FeatureExtractor(RIGHT).of(shown(angles_of(RIGHT, np.array(POSES[name], np.float64), STILL)))
     assert seen is not None
-    capsules = TaperedCapsules.of_segments(seen.joints_m, RIGHT.radius_m)
-    want = gaps_between(capsules.part(slice(0, 1), slice(2, 3)), capsules.part(slice(1, 5), slice(0, 3)))
+    capsules = finger_segments(seen.joints_m, RIGHT.radius_m)
+    want = gaps_between(capsules.of(slice(0, 1), slice(2, 3)), capsules.of(slice(1, 5), slice(0, 3)))
     found = thumb_touch(seen, RIGHT.radius_m)
     np.testing.assert_allclose(found.key_gap_m, want.gap_m, atol=1e-12)
     np.testing.assert_allclose(found.middle_m, want.middle_m[:, 2], atol=1e-12)

@@ -7,6 +7,7 @@ from bench.objects.views import Where, wander
 from common.arrays import Float
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
+from master.estimator.sensors import CameraArrays
 from master.objects.fit import Motion, Observations, PoseFit
 
 POINTS = np.array([[0.0, 0.0, 0.115], [0.052, 0.0, -0.084], [-0.052, 0.0, -0.084], [0.0, 0.04, 0.0]])
@@ -57,7 +58,8 @@ def seen(
     c, p, t, u, v = np.array(rows).T
     uv = np.stack([u, v], axis=1) + rng.normal(0.0, noise_px, (len(c), 2))
     sigma = np.full(len(c), max(noise_px, 0.05))
-    return Observations(c.astype(int), p.astype(int), t, uv, sigma, np.zeros(len(c)))
+    point, nothing = p.astype(int), np.zeros(len(c))
+    return Observations(c.astype(int), point, t, uv, sigma, nothing, point, now=nothing == 0.0)
 
 
 def error(T: Float, truth: Float) -> tuple[float, float]:
@@ -69,10 +71,10 @@ def error(T: Float, truth: Float) -> tuple[float, float]:
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_moving_object_is_found_from_unsynchronised_rolling_shutters(seed: int) -> None:
     where = wander(seed, np.array([0.04, 0.0, 0.5]), 0.5, np.pi)
-    fit = PoseFit(cameras(), POINTS, BEADS, NO_FLOOR)
+    fit = PoseFit(CameraArrays.of(cameras()), POINTS, BEADS, NO_FLOOR)
     observations = seen(where)
     start = rigid(rotation_vector_to_matrix(np.array([0.1, -0.1, 0.1])), np.array([0.01, -0.01, 0.02]))
-    found = fit(observations, Motion.still(where(0.0) @ start), feature=observations.point)
+    found = fit(observations, Motion.still(where(0.0) @ start))
     assert found is not None
     mm, deg = error(found.motion.T, where(0.0))
     assert mm < 0.15
@@ -83,8 +85,8 @@ def test_a_moving_object_is_found_from_unsynchronised_rolling_shutters(seed: int
 def test_two_beads_do_not_determine_the_rotation_about_their_line() -> None:
     where = wander(4, np.array([0.04, 0.0, 0.5]), 0.5, np.pi)
     observations = seen(where, points=(0, 1))
-    found = PoseFit(cameras(), POINTS, BEADS, NO_FLOOR)(
-        observations, Motion.still(where(0.0)), feature=observations.point
+    found = PoseFit(CameraArrays.of(cameras()), POINTS, BEADS, NO_FLOOR)(
+        observations, Motion.still(where(0.0))
     )
     assert found is not None
     size, axes = np.linalg.eigh(found.cov[3:6, 3:6])
@@ -98,8 +100,8 @@ def test_a_bead_that_is_another_thing_costs_itself() -> None:
     observations = seen(where, 0.1)
     wrong = observations.point == 3
     observations.uv[wrong] += [40.0, -25.0]
-    found = PoseFit(cameras(), POINTS, BEADS, NO_FLOOR)(
-        observations, Motion.still(where(0.0)), feature=observations.point
+    found = PoseFit(CameraArrays.of(cameras()), POINTS, BEADS, NO_FLOOR)(
+        observations, Motion.still(where(0.0))
     )
     assert found is not None
     assert not found.used[wrong].any()
@@ -111,11 +113,11 @@ def test_a_bead_that_is_another_thing_costs_itself() -> None:
 
 def test_its_covariance_is_honest() -> None:
     squares: list[float] = []
-    fit = PoseFit(cameras(), POINTS, BEADS, NO_FLOOR)
+    fit = PoseFit(CameraArrays.of(cameras()), POINTS, BEADS, NO_FLOOR)
     for seed in range(30):
         where = wander(seed, np.array([0.04, 0.0, 0.5]), 0.4, 2.0)
         observations = seen(where, 0.2, seed)
-        found = fit(observations, Motion.still(where(0.0)), feature=observations.point)
+        found = fit(observations, Motion.still(where(0.0)))
         assert found is not None
         truth = where(0.0)
         off = np.concatenate(
@@ -133,5 +135,5 @@ def test_behind_the_cameras_there_is_no_pose() -> None:
     where = wander(6, np.array([0.04, 0.0, 0.5]), 0.0, 0.0)
     observations = seen(where)
     behind = rigid(np.eye(3), np.array([0.0, 0.0, -0.5]))
-    fit = PoseFit(cameras(), POINTS, BEADS, NO_FLOOR)
-    assert fit(observations, Motion.still(behind), feature=observations.point) is None
+    fit = PoseFit(CameraArrays.of(cameras()), POINTS, BEADS, NO_FLOOR)
+    assert fit(observations, Motion.still(behind)) is None

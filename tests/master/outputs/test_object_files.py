@@ -12,12 +12,11 @@ from common.messages import Contact, Gesture, ObjectPose, ObjectSource, ResultMe
 from master.outputs.poses import RunFiles
 from master.outputs.result_files import (
     GESTURES,
+    Contacts,
     ObjectPoses,
     contact_path,
     gesture_line,
-    load_contact,
     load_gesture_messages,
-    load_object,
     object_path,
 )
 from master.replay.recorded import recorded_tags
@@ -73,8 +72,8 @@ def written(folder: Path) -> list[ResultMessage]:
 def test_results_are_read_back_exactly(tmp_path: Path) -> None:
     results = written(tmp_path)
     poses, near = (
-        load_object(object_path(tmp_path, "cube")),
-        load_contact(contact_path(tmp_path, HAND, "cube")),
+        ObjectPoses.load(object_path(tmp_path, "cube")),
+        Contacts.load(contact_path(tmp_path, HAND, "cube")),
     )
     assert (poses.object, near.hand, near.object, len(poses), len(near)) == ("cube", HAND, "cube", 9, 9)
     for kind, table in ((ObjectPose, poses), (Contact, near)):
@@ -119,7 +118,7 @@ def test_a_run_without_objects_or_gestures_has_an_empty_file_of_them(tmp_path: P
     assert {path.name for path in tmp_path.iterdir()} == {"poses.npz", "gestures.jsonl"}
     assert load_gesture_messages(tmp_path / GESTURES) == []
     RunFiles(tmp_path / "poses.npz", {HAND: 6}, ["cube"]).close()
-    assert len(load_object(object_path(tmp_path, "cube"))) == 0
+    assert len(ObjectPoses.load(object_path(tmp_path, "cube"))) == 0
 
 
 def test_what_the_files_were_not_opened_for_is_refused(tmp_path: Path) -> None:
@@ -158,17 +157,17 @@ def test_a_broken_line_of_gestures_is_named(tmp_path: Path, line: bytes, expecte
 def test_a_table_of_another_kind_is_named(tmp_path: Path) -> None:
     written(tmp_path)
     with pytest.raises(RecordingError, match=r"object_cube\.npz: key 'distance_m' is missing"):
-        load_contact(object_path(tmp_path, "cube"))
+        Contacts.load(object_path(tmp_path, "cube"))
     data = dict(np.load(object_path(tmp_path, "cube")))
     np.savez(tmp_path / "cut.npz", **(data | {"cov": data["cov"][:, :3]}))
     with pytest.raises(
         RecordingError, match=r"cut\.npz: cov: float64 \(9, 3, 6\), expected float64 \(9, 6, 6\)"
     ):
-        load_object(tmp_path / "cut.npz")
+        ObjectPoses.load(tmp_path / "cut.npz")
 
 
 def test_no_poses_of_an_object_are_a_table_without_rows() -> None:
-    assert ObjectPoses.of("cube", []).cov.shape == (0, 6, 6)
+    assert ObjectPoses.stacked([], object="cube").cov.shape == (0, 6, 6)
 
 
 TAGS: dict[str, object] = {

@@ -8,7 +8,7 @@ import pytest
 
 from common.errors import RecordingError
 from common.messages import HandPose
-from master.outputs.poses import Poses, PosesFile, PosesTruth, load_poses, save_poses
+from master.outputs.poses import Poses, PosesFile, PosesTruth
 
 FIXED = "t_ns position_m orientation_wxyz radius_m valid tracked cov_m2 angles_rad markers_m markers_raw_m"
 
@@ -38,7 +38,7 @@ def random_pose(index: int, markers: int = 6, hand: str = "default-right") -> Ha
 
 
 def write(path: Path, poses: list[HandPose], markers: int = 6) -> None:
-    sink = PosesFile(path, "default-right", markers)
+    sink = PosesFile(path, poses[0].hand if poses else "default-right", markers)
     for pose in poses:
         sink.write(pose)
     sink.close()
@@ -47,11 +47,10 @@ def write(path: Path, poses: list[HandPose], markers: int = 6) -> None:
 def test_what_is_written_is_read_back_exactly(tmp_path: Path) -> None:
     poses = [random_pose(i) for i in range(40)]
     write(tmp_path / "poses.npz", poses)
-    loaded = load_poses(tmp_path / "poses.npz")
+    loaded = Poses.load(tmp_path / "poses.npz")
     assert loaded.hand == "default-right"
     assert len(loaded) == 40
-    for i, pose in enumerate(poses):
-        again = loaded.pose(i)
+    for again, pose in zip(loaded.messages(), poses, strict=True):
         for field in HandPose.__struct_fields__:
             np.testing.assert_array_equal(getattr(again, field), getattr(pose, field), err_msg=field)
 
@@ -70,7 +69,7 @@ def test_two_runs_are_byte_identical_and_another_pose_is_not(tmp_path: Path) -> 
     poses = [random_pose(i) for i in range(10)]
     write(tmp_path / "a.npz", poses)
     write(tmp_path / "b.npz", poses)
-    save_poses(tmp_path / "c.npz", Poses.of(poses))
+    write(tmp_path / "c.npz", Poses.of(poses).messages())
     write(tmp_path / "d.npz", [*poses[:-1], random_pose(99)])
     first = (tmp_path / "a.npz").read_bytes()
     assert first == (tmp_path / "b.npz").read_bytes()
@@ -80,7 +79,7 @@ def test_two_runs_are_byte_identical_and_another_pose_is_not(tmp_path: Path) -> 
 
 def test_a_run_that_saw_nothing_is_a_file_of_no_rows(tmp_path: Path) -> None:
     write(tmp_path / "poses.npz", [], markers=4)
-    loaded = load_poses(tmp_path / "poses.npz")
+    loaded = Poses.load(tmp_path / "poses.npz")
     assert len(loaded) == 0
     assert loaded.marker_count == 4
 
@@ -94,7 +93,7 @@ def test_the_file_appears_only_when_it_is_complete(tmp_path: Path) -> None:
     assert path.read_bytes() == b"an older run"
     sink.close()
     sink.close()
-    assert len(load_poses(path)) == 1
+    assert len(Poses.load(path)) == 1
     assert [p.name for p in tmp_path.iterdir()] == ["poses.npz"]
 
 
@@ -117,8 +116,8 @@ def test_full_disk_is_a_clear_error_and_leaves_nothing_half_written(
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_disk_that_fills_while_tracking_is_reported_by_write(tmp_path: Path) -> None:
     sink = PosesFile(tmp_path / "poses.npz", "default-right", 6)
-    sink._file._spool.close()
-    sink._file._spool = Path("/dev/full").open("r+b", buffering=0)  # noqa: SIM115
+    sink._spool.close()
+    sink._spool = Path("/dev/full").open("r+b", buffering=0)  # noqa: SIM115
     with pytest.raises(RecordingError, match="No space left"):
         sink.write(random_pose(0))
     sink.close()  # the run may still end in good order
@@ -170,7 +169,7 @@ def test_a_broken_file_is_refused_by_name(tmp_path: Path, spoil: Callable[[Path]
     write(path, [random_pose(0)])
     spoil(path)
     with pytest.raises(RecordingError, match=r"poses\.npz"):
-        load_poses(path)
+        Poses.load(path)
 
 
 def test_truth_gives_millimetres_and_leaves_invalid_joints_out() -> None:
@@ -178,9 +177,9 @@ def test_truth_gives_millimetres_and_leaves_invalid_joints_out() -> None:
     poses = Poses.of([pose])
     webxr = poses.position_m[:, 1:] + np.array([0.003, 0.0, 0.004])  # 5 mm off
     truth = PosesTruth.of_webxr(webxr, poses.markers_raw_m + np.array([0.0, 0.002, 0.0]))
-    error = truth.joint_error_m(poses)
+    error = truth.errors_m(poses)["joints"]
     np.testing.assert_array_equal(np.isnan(error), ~poses.valid[:, 1:])
     np.testing.assert_allclose(error[poses.valid[:, 1:]], 0.005, rtol=1e-9)
-    seen = truth.marker_error_m(poses)[0]
+    seen = truth.errors_m(poses)["markers"][0]
     np.testing.assert_allclose(seen[~np.isnan(seen)], 0.002, rtol=1e-9)
     np.testing.assert_allclose(truth.joints_m[0, 0], (webxr[0, 10] + webxr[0, 11]) / 2)

@@ -10,7 +10,6 @@ import rerun as rr
 from msgspec.structs import replace
 
 from common.arrays import Image
-from common.bus.bus import LoopbackBus
 from common.calibration import CameraCalibration, Intrinsics, RigCalibration, Volume
 from common.errors import PhalanxError, RecordingError
 from common.geometry.transforms import matrix_to_quaternion, rigid
@@ -23,6 +22,7 @@ from master.outputs.rerun import ViewerProcess, run_viewer, viewer_arguments, wr
 from master.outputs.rerun_scene import RerunScene
 from master.rig.setup import RigSetup
 from tests.hand_helpers import detections
+from tests.memory_bus import LoopbackBus
 
 MODEL = HandModel.of(generated_profile("test-hand", "right"))
 EYE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -409,8 +409,8 @@ def test_every_viewer_is_bound_to_this_machine_with_a_memory_limit(web_port: int
 def test_a_viewer_without_a_display_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
         monkeypatch.delenv(name, raising=False)
-    with pytest.raises(PhalanxError, match=r"cannot open a window.*--web or --save"), ViewerProcess(None):
-        pass
+    with pytest.raises(PhalanxError, match=r"cannot open a window.*--web or --save"):
+        ViewerProcess(None)
 
 
 def test_a_viewer_whose_display_does_not_answer_is_an_error_also_when_it_began_to_listen(

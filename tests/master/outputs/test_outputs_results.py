@@ -8,7 +8,6 @@ import pytest
 import rerun as rr
 from msgspec.structs import replace
 
-from common.bus.bus import LoopbackBus
 from common.calibration.object_profile import (
     Bead,
     BoxShape,
@@ -24,6 +23,7 @@ from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
 from master.outputs.rerun_results import arc, label_of
 from tests.master.outputs.test_outputs_rerun import SETUP, STEP_NS, Viewing, moving_hand, rows_of
+from tests.memory_bus import LoopbackBus
 
 START_NS = 10**15
 ROTATED = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, 0.05), (0.0, 0.0, 0.0, 1.0))

@@ -5,10 +5,10 @@ import threading
 
 import pytest
 
-from common.bus.bus import LoopbackBus
 from common.errors import BusError
 from common.messages import Command, Health
 from master.outputs.bus import PictureAsker
+from tests.memory_bus import LoopbackBus
 from tests.network_helpers import until
 
 

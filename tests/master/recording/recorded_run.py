@@ -6,7 +6,6 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from common.bus.bus import LoopbackBus
 from common.messages import Contact, Gesture, HandPose, Health, MarkerDetections
 from common.recording.messages import MessageWriter
 from master.recording.files import carried_files, rigs_text
@@ -16,6 +15,7 @@ from master.rig.setup import RigFiles
 from master.run.ingest import MessageQueue
 from master.run.link_senders import SensorMessage
 from master.run.solver_supervisor import LoadShedding
+from tests.memory_bus import LoopbackBus
 from tests.network_helpers import ManualClock
 from tests.synthetic_run import synthetic_run
 

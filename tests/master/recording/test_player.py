@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.bus.bus import LoopbackBus
 from common.errors import BusError, PhalanxError, RecordingError
 from common.messages import Backlog, Command, HandPose, ResultMessage
 from common.messages.streams import MASTER
 from common.recording.messages import open_messages
-from master.outputs.poses import load_poses
+from master.outputs.poses import Poses
 from master.recording.files import recorded_setups
 from master.recording.lines import events_of, table
 from master.recording.play import PlaySettings, run_play
 from master.recording.player import Passed, Player, ReplayClock
 from master.run.solver_supervisor import MOST
 from tests.master.recording.recorded_run import MOST_FRAMES, RecordedRun, overloaded_run, recorded_run
+from tests.memory_bus import LoopbackBus
 from tests.network_helpers import until
 
 FRAMES, SHORT = MOST_FRAMES, 8
@@ -170,7 +170,7 @@ def test_files_of_a_run_are_written_and_a_stop_ends_it(
 ) -> None:
     out = tmp_path / "out"
     run_play(PlaySettings(twice.path, 0.0, out=out), None, threading.Event(), lambda _line: None)
-    assert len(load_poses(out / "poses.npz")) == twice.live.counts["poses"] > 3
+    assert len(Poses.load(out / "poses.npz")) == twice.live.counts["poses"] > 3
     stop = threading.Event()
     thread, passes = played(PlaySettings(run.path, speed=0.001, loop=True), LoopbackBus(), stop)
     stop.set()

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from common.bus.bus import LoopbackBus
 from common.errors import RecordingError
 from common.messages import Command, Health
-from common.messages.command_bodies import RawWish
+from common.messages.command_bodies import RawRequest
 from common.recording.messages import open_messages
 from master.recording import record, recorder
 from master.recording.lines import raw_lines
@@ -17,6 +16,7 @@ from master.recording.record import RecordSettings, run_recorder
 from master.recording.recorder import Progress, RawAsker
 from master.rig.setup import RigFiles
 from tests.master.recording.test_recorder import FakeMaster, recording
+from tests.memory_bus import LoopbackBus
 from tests.network_helpers import until
 
 
@@ -31,11 +31,11 @@ class FakeSlave:
 
     def answer(self, command: Command) -> Health:
         if command.verb == "raw":
-            wish = RawWish.of(command.body)
-            assert wish.lease_s > 0.0
-            if self.why_not or (not self.on and wish.name in self.kept):
-                raise RecordingError(self.why_not or f"{wish.name}: holds something already")
-            self.kept += [] if self.on else [wish.name]
+            request = RawRequest.of(command.body)
+            assert request.lease_s > 0.0
+            if self.why_not or (not self.on and request.name in self.kept):
+                raise RecordingError(self.why_not or f"{request.name}: holds something already")
+            self.kept += [] if self.on else [request.name]
             self.on = True
         elif command.verb == "raw_stop":
             self.on = False

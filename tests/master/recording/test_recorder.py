@@ -10,7 +10,7 @@ from typing import cast
 
 import pytest
 
-from common.bus.bus import Bus, LoopbackBus
+from common.bus.bus import Bus
 from common.bus.zenoh_bus import ZenohBus
 from common.clock import now_ns
 from common.errors import BusError, CalibrationError, RecordingError
@@ -24,6 +24,7 @@ from master.recording.record import NAME, MasterClock, RecordSettings, run_recor
 from master.recording.recorder import MessageRecorder, Progress
 from master.rig.setup import RigFiles
 from master.run.solver_supervisor import LoadShedding
+from tests.memory_bus import LoopbackBus
 from tests.network_helpers import ManualClock, detections, free_endpoint, until
 from tests.picture_helpers import TINY
 

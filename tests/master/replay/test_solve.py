@@ -10,7 +10,7 @@ import pytest
 from common.errors import RecordingError
 from common.recording.frame_recording import FrameRecording, Manifest
 from master.commands.summary import read_summary, write_summary
-from master.outputs.poses import Poses, load_poses
+from master.outputs.poses import Poses
 from master.replay.offline import fingers_of, solve
 from tests.hand_helpers import MARKERS, RIGHT
 from tests.synthetic_run import SyntheticRun, hand_at, synthetic_run
@@ -63,10 +63,10 @@ def test_a_run_is_written_scored_and_repeated_byte_by_byte(tmp_path: Path, short
     for out in outs:
         out.mkdir()
         opened = recording(tmp_path, short_run)
-        summary = solve(opened, short_run.setup, tmp_path, out, lambda d, t: progress.append((d, t)))
+        summary = solve(opened, [short_run.setup], tmp_path, out, lambda d, t: progress.append((d, t)))
     assert (outs[0] / "poses.npz").read_bytes() == (outs[1] / "poses.npz").read_bytes()
     assert progress[:20] == [(k, 20) for k in range(1, 21)]
-    poses = load_poses(outs[0] / "poses.npz")
+    poses = Poses.load(outs[0] / "poses.npz")
     assert len(poses) == summary["poses"] == summary["poses_valid"] == 10
     assert (poses.latency_ns == 0).all()
     stored = json.loads((outs[1] / "summary.json").read_text())
@@ -84,13 +84,13 @@ def test_frames_lost_before_they_were_recorded_are_counted(tmp_path: Path, short
     first = next(m.seq for m in short_run.messages if m.camera == "left")
     gaps = np.array([first + k + (2 if k >= 4 else 0) + (k >= 7) for k in range(10)])
     write_detections(tmp_path, short_run, seq=gaps)
-    summary = solve(recording(tmp_path, short_run), short_run.setup, tmp_path, tmp_path)
+    summary = solve(recording(tmp_path, short_run), [short_run.setup], tmp_path, tmp_path)
     assert summary["lost"] == 6  # three of each camera
 
 
 def test_without_a_truth_there_are_no_scores(tmp_path: Path, short_run: SyntheticRun) -> None:
     write_detections(tmp_path, short_run)
-    summary = solve(recording(tmp_path, short_run), short_run.setup, tmp_path, tmp_path)
+    summary = solve(recording(tmp_path, short_run), [short_run.setup], tmp_path, tmp_path)
     assert "joint_mm" not in summary
     assert "marker_mm" not in summary
 
@@ -104,13 +104,13 @@ def test_files_without_sigma_and_rivals_are_solved_with_a_sigma_from_their_quali
         folder.mkdir()
         rejected = {"sigma_px": None, "alt_uv": None} if folder is old else {}
         write_detections(folder, short_run, **rejected)
-        solve(recording(folder, short_run), short_run.setup, folder, folder)
-        poses.append(load_poses(folder / "poses.npz"))
+        solve(recording(folder, short_run), [short_run.setup], folder, folder)
+        poses.append(Poses.load(folder / "poses.npz"))
     # The run's markers are of full quality and state the 0.1 px that is the default for those.
     np.testing.assert_array_equal(poses[0].cov_m2, poses[1].cov_m2)
     write_detections(old, short_run, sigma_px=None, alt_uv=None, quality=np.full((10, 6), np.nan))
-    solve(recording(old, short_run), short_run.setup, old, old)
-    unknown = load_poses(old / "poses.npz")
+    solve(recording(old, short_run), [short_run.setup], old, old)
+    unknown = Poses.load(old / "poses.npz")
     assert np.trace(unknown.cov_m2[5, 10]) > 2.0 * np.trace(poses[0].cov_m2[5, 10])  # the index's tip
 
 
@@ -125,9 +125,9 @@ def test_no_detections_at_all_are_no_poses(tmp_path: Path, short_run: SyntheticR
         "alt_uv": np.zeros((0, 6, 2)),
     }
     write_detections(tmp_path, short_run, **empty)
-    summary = solve(recording(tmp_path, short_run), short_run.setup, tmp_path, tmp_path)
+    summary = solve(recording(tmp_path, short_run), [short_run.setup], tmp_path, tmp_path)
     assert summary["poses"] == 0
-    assert len(load_poses(tmp_path / "poses.npz")) == 0
+    assert len(Poses.load(tmp_path / "poses.npz")) == 0
 
 
 def test_a_missing_file_says_which_command_makes_it(tmp_path: Path, short_run: SyntheticRun) -> None:
@@ -136,7 +136,7 @@ def test_a_missing_file_says_which_command_makes_it(tmp_path: Path, short_run: S
     with pytest.raises(
         RecordingError, match=r"detections_right\.npz.*`phalanx-slave run -o` for camera 'right'"
     ):
-        solve(recording(tmp_path, short_run), short_run.setup, tmp_path, tmp_path)
+        solve(recording(tmp_path, short_run), [short_run.setup], tmp_path, tmp_path)
 
 
 @pytest.mark.parametrize("keep", [0, 1, 100, 2000])
@@ -145,25 +145,25 @@ def test_a_cut_file_is_named(tmp_path: Path, short_run: SyntheticRun, keep: int)
     path = tmp_path / "detections_left.npz"
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(RecordingError, match=r"detections_left\.npz"):
-        solve(recording(tmp_path, short_run), short_run.setup, tmp_path, tmp_path)
+        solve(recording(tmp_path, short_run), [short_run.setup], tmp_path, tmp_path)
 
 
 BROKEN: dict[str, tuple[dict[str, object], str]] = {
     "no uv": ({"uv": None}, "'uv' is missing"),
-    "five markers": ({"uv": np.zeros((10, 5, 2))}, r"\(10, 5, 2\), the rig needs \(10, 6, 2\)"),
+    "five markers": ({"uv": np.zeros((10, 5, 2))}, r"\(10, 5, 2\), expected \(10, 6, 2\)"),
     "too few areas": ({"area_px2": np.zeros((9, 6))}, "detections_left"),
     "text": ({"uv": np.full((10, 6, 2), "x")}, "detections_left"),
-    "times of two axes": ({"t_ns": np.zeros((10, 2), np.int64)}, "t_ns and seq"),
+    "times of two axes": ({"t_ns": np.zeros((10, 2), np.int64)}, "t_ns has shape"),
     "times in seconds": ({"t_ns": np.zeros(10)}, "detections_left"),
-    "too few sigmas": ({"sigma_px": np.ones((10, 5))}, r"sigma_px and alt_uv have shapes \(10, 5\)"),
+    "too few sigmas": ({"sigma_px": np.ones((10, 5))}, r"sigma_px has shape \(10, 5\)"),
     "no sigma where one is seen": (
         {"sigma_px": np.full((10, 6), np.nan)},
         "row 0: sigma_px: must be positive",
     ),
     "a sigma of zero": ({"sigma_px": np.zeros((10, 6))}, "row 0: sigma_px: 0 is not within"),
-    "rivals of five": ({"alt_uv": np.zeros((10, 5, 2))}, r"\(10, 5, 2\), expected \(10, 6\) and"),
+    "rivals of five": ({"alt_uv": np.zeros((10, 5, 2))}, r"\(10, 5, 2\), expected \(10, 6, 2\)"),
     "infinitely far": ({"uv": np.full((10, 6, 2), np.inf)}, "row 0: uv: inf is not within"),
-    "fewer numbers than times": ({"seq": np.zeros(3, np.int64)}, "t_ns and seq"),
+    "fewer numbers than times": ({"seq": np.zeros(3, np.int64)}, "t_ns has shape"),
 }
 
 
@@ -172,7 +172,7 @@ def test_arrays_that_do_not_fit_are_named(tmp_path: Path, short_run: SyntheticRu
     changes, text = BROKEN[case]
     write_detections(tmp_path, short_run, **changes)
     with pytest.raises(RecordingError, match=text) as error:
-        solve(recording(tmp_path, short_run), short_run.setup, tmp_path, tmp_path)
+        solve(recording(tmp_path, short_run), [short_run.setup], tmp_path, tmp_path)
     assert "detections_left.npz" in str(error.value)
 
 
@@ -184,8 +184,8 @@ def test_unrelated_frames_are_solved_without_memory(tmp_path: Path, short_run: S
     write_detections(tmp_path, short_run)
     related = recording(tmp_path, short_run)
     manifest = msgspec.structs.replace(related.manifest, continuous=False)
-    solve(FrameRecording(tmp_path, manifest, ()), short_run.setup, tmp_path, tmp_path)
-    poses = load_poses(tmp_path / "poses.npz")
+    solve(FrameRecording(tmp_path, manifest, ()), [short_run.setup], tmp_path, tmp_path)
+    poses = Poses.load(tmp_path / "poses.npz")
     np.testing.assert_array_equal(poses.markers_m, poses.markers_raw_m)
 
 

@@ -18,8 +18,8 @@ from common.recording.frame_recording import FrameRecording, Manifest
 from common.sim.record import named_angles
 from common.sim.render import Renderer
 from common.sim.wrist.record import WristTake
-from master.outputs.poses import load_poses
-from master.replay.offline import rigs_to_solve, solve_hands
+from master.outputs.poses import Poses
+from master.replay.offline import rigs_to_solve, solve
 from master.replay.recorded import recorded_samples
 from master.rig.setup import RigSetup, setups_of
 from tests.hand_helpers import LEFT
@@ -45,7 +45,7 @@ class Recorded:
         rigs = rigs_to_solve(self.opened.manifest, [], only, solver_mode)
         out.mkdir()
         setups = setups_of(rigs, self.opened.manifest.cameras, lambda _name: self.both.markers.hand)
-        return solve_hands(self.opened, setups, self.opened.folder, out)
+        return solve(self.opened, setups, self.opened.folder, out)
 
 
 def write_detections(folder: Path, messages: Sequence[Observed]) -> None:
@@ -70,7 +70,7 @@ def write_truth(folder: Path, both: Both) -> None:
         "angles": [named_angles(both.scene.model, one.angles_rad) for one in truths],
         "paint_centroid": [one.markers_m for one in truths],
         "frac": [
-            [np.nan_to_num(renderer.visible_fraction(t)) for renderer in renderers] for t in times.tolist()
+            [np.nan_to_num(renderer.markers(t).visible) for renderer in renderers] for t in times.tolist()
         ],
     }
     wrist_scene = {
@@ -96,7 +96,7 @@ def test_both_streams_make_one_hand_that_is_scored_against_both_truths(
     recorded: Recorded, tmp_path: Path
 ) -> None:
     summary = recorded.solve(tmp_path / "out", solver_mode="fk")
-    poses = load_poses(tmp_path / "out/poses.npz")
+    poses = Poses.load(tmp_path / "out/poses.npz")
     assert len(poses) == summary["poses"]
     assert len(poses) > 15
     assert poses.marker_count == 6
@@ -123,7 +123,7 @@ def test_either_stream_is_solved_alone_from_the_same_detections(
     assert "not used" not in caplog.text  # the IMU is of a rig that is left out
     assert set(markers) & {"joint_mm", "laser_mm", "cycles_missed"} == {"joint_mm"}
     assert set(wrist) & {"marker_mm", "laser_mm", "cycles_missed"} == {"laser_mm", "cycles_missed"}
-    assert load_poses(tmp_path / "wrist/poses.npz").marker_count == 0
+    assert Poses.load(tmp_path / "wrist/poses.npz").marker_count == 0
     for name in ("left", "right"):
         assert name not in wrist["camera_hz"]  # type: ignore[operator]
     counts = wrist["counts"]
@@ -153,10 +153,10 @@ def test_a_second_hand_has_files_of_its_own_and_no_score_of_the_first(
     wrist_scene = msgspec.structs.replace(both.wrist.rig, solver_mode="fk")
     first = RigSetup.of(wrist_scene, both.wrist.cameras, both.wrist.hand)
     second = RigSetup.of(left, both.markers.cameras, LEFT)
-    solve_hands(recorded.opened, (first, second), recorded.opened.folder, tmp_path)
+    solve(recorded.opened, (first, second), recorded.opened.folder, tmp_path)
     names = {"poses.npz", "summary.json", "poses-made-left.npz", "summary-made-left.json", "gestures.jsonl"}
     assert {path.name for path in tmp_path.iterdir()} == names
-    assert load_poses(tmp_path / "poses-made-left.npz").hand == "made-left"
+    assert Poses.load(tmp_path / "poses-made-left.npz").hand == "made-left"
     other = msgspec.json.decode((tmp_path / "summary-made-left.json").read_bytes())
     assert "joint_mm" not in other
 

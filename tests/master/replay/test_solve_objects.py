@@ -10,8 +10,8 @@ import pytest
 from common.errors import RecordingError
 from common.messages import ObjectSource, TagDetections
 from common.recording.frame_recording import FrameRecording, Manifest
-from master.outputs.result_files import contact_path, load_contact, load_object, object_path
-from master.replay.offline import rigs_to_solve, solve_hands
+from master.outputs.result_files import Contacts, ObjectPoses, contact_path, object_path
+from master.replay.offline import rigs_to_solve, solve
 from master.rig.setup import RigSetup, load_setups, setups_with_hands
 from tests.object_run import PERIOD_NS, START_NS, ObjectRun, Sent, object_run
 
@@ -81,17 +81,17 @@ def test_an_object_is_solved_scored_and_written_alike_every_time(
     summary: dict[str, object] = {}
     for out in outs:
         out.mkdir()
-        summary = solve_hands(recorded, setups, recorded.folder, out)
+        summary = solve(recorded, setups, recorded.folder, out)
     names = {path.name for path in outs[0].iterdir()}
     assert names == {
         *("poses.npz", "object_cube.npz", "contact_default-right_cube.npz", "gestures.jsonl", "summary.json")
     }
     for name in names - {"summary.json"}:  # that has the times of the stages
         assert (outs[0] / name).read_bytes() == (outs[1] / name).read_bytes(), name
-    poses = load_object(object_path(outs[0], "cube"))
+    poses = ObjectPoses.load(object_path(outs[0], "cube"))
     assert set(poses.source[poses.tracked].tolist()) == {int(ObjectSource.TAGS)}
     assert (poses.latency_ns == 0).all()
-    assert len(load_contact(contact_path(outs[0], "default-right", "cube"))) == summary["poses"]
+    assert len(Contacts.load(contact_path(outs[0], "default-right", "cube"))) == summary["poses"]
     assert summary["object_mm"] < 1.0  # type: ignore[operator]
     assert summary["object_deg"] < 1.0  # type: ignore[operator]
     assert summary["object_tracked"] > 0.7  # type: ignore[operator]
@@ -118,7 +118,7 @@ def test_a_wrist_device_with_the_cameras_changes_nothing_of_the_object(
     for one in (recorded, both):
         out = recorded.folder / one.manifest.kind
         out.mkdir()
-        solve_hands(one, setups_of(one, root), recorded.folder, out)
+        solve(one, setups_of(one, root), recorded.folder, out)
         found.append(object_path(out, "cube").read_bytes())
     assert found[0] == found[1]
 
@@ -126,4 +126,4 @@ def test_a_wrist_device_with_the_cameras_changes_nothing_of_the_object(
 def test_tags_that_nobody_looked_for_are_asked_for(recorded: FrameRecording, root: Path) -> None:
     (recorded.folder / "tags_right.npz").unlink()
     with pytest.raises(RecordingError, match=r"tags_right\.npz.*`phalanx-slave run -o` for camera 'right'"):
-        solve_hands(recorded, setups_of(recorded, root), recorded.folder, recorded.folder)
+        solve(recorded, setups_of(recorded, root), recorded.folder, recorded.folder)

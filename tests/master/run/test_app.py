@@ -16,7 +16,7 @@ from common.messages import HandPose, ImuSample, MarkerDetections, ResultMessage
 from master.monitor.report import cameras_line
 from master.rig.pipeline import pipeline_of
 from master.rig.setup import RigSetup
-from master.run.app import AuxiliaryMessage, Observed, RunFigures, StageTimes, health, run
+from master.run.app import AuxiliaryMessage, RunFigures, StageTimes, health, observed, run
 from master.run.dispatcher import Dispatcher
 from tests.hand_helpers import detections
 from tests.synthetic_run import SyntheticRun, hand_at, setup_of, synthetic_run
@@ -104,8 +104,8 @@ def test_samples_of_an_imu_turn_the_palm_and_are_no_frames(short_run: SyntheticR
     script = sorted([*short_run.messages, *samples], key=lambda message: message.t_ns)
     stop, sink, figures = threading.Event(), Collector(), RunFigures()
     hands, watched = world_of(setup), list[MarkerDetections]()
-    observed = Observed(hands.push, figures.rates, watched.append)
-    run(ScriptedSource([*script], stop).get, observed.push, [sink], ScriptedClock(), figures, stop)
+    push = observed(hands.push, figures.rates, watched.append)
+    run(ScriptedSource([*script], stop).get, push, [sink], ScriptedClock(), figures, stop)
     assert watched == short_run.messages
     assert set(figures.rates.camera_hz) == {"left", "right"}
     assert hands.counts["orientation.used"] == len(sink.poses) >= 5

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from common.arrays import Float
 from common.hand.model import HandJoints
 from common.messages import HandPose
-from master.console.controls import try_filter
+from master.console.controls import FilterTuner
 from tests.hand_helpers import RIGHT, palm
 from tests.master.run.test_tuning import Master, master
 from tests.network_helpers import PATIENCE_S
@@ -41,7 +42,7 @@ def published(
 ) -> tuple[Float, Float]:
     """Times (T,) [s] and joints (T, 26, 3) [m] that come once the settings act on this hand."""
     running.hand = hand
-    try_filter(lambda command: running.bus.ask(command, 30.0), "bench", settings)
+    FilterTuner("bench", Path(), lambda command: running.bus.ask(command, 30.0)).set(settings)
     since_ns = time.monotonic_ns() + SETTLED_NS
     deadline = time.monotonic() + PATIENCE_S
     t: list[float] = []

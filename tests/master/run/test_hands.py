@@ -15,7 +15,7 @@ from common.errors import CalibrationError
 from common.messages import Detections, ImuSample, MarkerDetections
 from master.estimator.pipeline import SolvedPose
 from master.monitor.clocks import ClockMonitor
-from master.outputs.poses import RunFiles, load_poses
+from master.outputs.poses import Poses, RunFiles
 from master.rig.pipeline import pipeline_of
 from master.rig.setup import RigFiles, load_setup
 from master.run.app import StageTimes
@@ -111,7 +111,7 @@ def test_each_hand_has_a_poses_file(tmp_path: Path) -> None:
         files.write(random_pose(0, 6, "c"))
     files.close()
     files.close()
-    found = {hand: load_poses(tmp_path / name) for hand, name in (("a", "poses.npz"), ("b", "poses-b.npz"))}
+    found = {hand: Poses.load(tmp_path / name) for hand, name in (("a", "poses.npz"), ("b", "poses-b.npz"))}
     assert {hand: (len(poses), poses.hand) for hand, poses in found.items()} == {"a": (1, "a"), "b": (2, "b")}
 
 

@@ -13,8 +13,8 @@ from common.bus.zenoh_bus import ZenohBus
 from common.clock import SystemClock
 from common.errors import BusError
 from common.messages import Command, HandPose
-from master.outputs.poses import load_poses
-from master.rig.setup import load_setup, load_setups
+from master.outputs.poses import Poses
+from master.rig.setup import RigFiles, load_setup, load_setups
 from master.run.live import LiveSettings, run_live
 from slave.uplink import Uplink
 from tests.network_helpers import detections, free_udp_port, until
@@ -31,7 +31,15 @@ def test_a_master_tracks_answers_refuses_and_ends(tmp_path: Path, root: Path) ->
     key = bytes.fromhex(new_key())
     beacon, bus = free_udp_port(), f"tcp/127.0.0.1:{free_tcp_port()}"
     poses_file, summary_file = tmp_path / "poses.npz", tmp_path / "live.json"
-    settings = LiveSettings(("127.255.255.255", beacon), ("127.0.0.1", 0), bus, 2.0, poses_file, summary_file)
+    settings = LiveSettings(
+        ("127.255.255.255", beacon),
+        ("127.0.0.1", 0),
+        bus,
+        RigFiles(root / "calib_json", ("desk",)),
+        2.0,
+        poses_file,
+        summary_file,
+    )
     setup = load_setup(root / "calib_json", "desk")
     lines: list[str] = []
     stop = threading.Event()
@@ -63,7 +71,7 @@ def test_a_master_tracks_answers_refuses_and_ends(tmp_path: Path, root: Path) ->
         for end in (left, right, asker):
             end.close()
     summary = json.loads(summary_file.read_text())
-    poses = load_poses(poses_file)
+    poses = Poses.load(poses_file)
     assert len(poses) == summary["poses"] > 20
     assert summary["lost"] == 0
     assert lines[0].startswith("listening on 127.0.0.1:")
@@ -76,6 +84,7 @@ def test_a_master_of_two_hands_publishes_each_under_its_name(tmp_path: Path, roo
         ("127.255.255.255", beacon),
         ("127.0.0.1", 0),
         bus,
+        RigFiles(root / "calib_json", ("desk", "wrist-left")),
         5.0,
         tmp_path / "poses.npz",
         tmp_path / "live.json",
@@ -114,5 +123,5 @@ def test_a_master_of_two_hands_publishes_each_under_its_name(tmp_path: Path, roo
         for end in (*ends.values(), asker):
             end.close()
     assert {pose.hand for pose in poses if isinstance(pose, HandPose)} == {"default-right", "default-left"}
-    assert len(load_poses(tmp_path / "poses-default-left.npz")) == 20
-    assert len(load_poses(tmp_path / "poses.npz")) > 0
+    assert len(Poses.load(tmp_path / "poses-default-left.npz")) == 20
+    assert len(Poses.load(tmp_path / "poses.npz")) > 0

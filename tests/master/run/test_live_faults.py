@@ -36,9 +36,7 @@ def test_a_fault_of_one_hands_solver_costs_its_sender_a_pause_and_the_other_hand
     monkeypatch.setattr(LivePipeline, "push", faulty)
     key, clock, bus = bytes.fromhex(new_key()), SystemClock(), f"tcp/127.0.0.1:{free_tcp_port()}"
     files = RigFiles(root / "calib_json", ("desk", "wrist-left"))
-    settings = LiveSettings(
-        ("127.255.255.255", beacon := free_udp_port()), ("127.0.0.1", 0), bus, 5.0, files=files
-    )
+    settings = LiveSettings(("127.255.255.255", beacon := free_udp_port()), ("127.0.0.1", 0), bus, files)
     setups = files.load()
     cycle = exact_cycle(setups[1], wrist_scene(setups[1]).truth(0.5), 0)
     stop = threading.Event()

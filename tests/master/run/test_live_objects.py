@@ -24,7 +24,7 @@ from common.messages import (
     TrackerPose,
 )
 from master.monitor.report import cameras_line
-from master.outputs.result_files import contact_path, load_contact, load_object, object_path
+from master.outputs.result_files import Contacts, ObjectPoses, contact_path, object_path
 from master.rig.setup import RigFiles, load_setups
 from master.run.live import LiveSettings, run_live
 from slave.uplink import Uplink
@@ -64,10 +64,10 @@ class Master:
             ("127.255.255.255", beacon),
             ("127.0.0.1", 0),
             endpoint,
+            RigFiles(tree, ("desk-cube",)),
             5.0,
             out / "poses.npz",
             out / "live.json",
-            RigFiles(tree, ("desk-cube",)),
         )
         self.lines: list[str] = []
         self.stop = threading.Event()
@@ -153,8 +153,8 @@ def test_objects_and_contact_come_on_the_bus_and_into_files(
     assert len(hands) + dropped_epochs > FRAMES // 2
     assert {(one.hand, one.object) for one in contacts} == {("default-right", "cube")}
     assert all(isinstance(one, Gesture) for one in drained(master, "gesture"))
-    assert len(load_object(object_path(tmp_path, "cube"))) == len(poses)
-    assert len(load_contact(contact_path(tmp_path, "default-right", "cube"))) == len(contacts)
+    assert len(ObjectPoses.load(object_path(tmp_path, "cube"))) == len(poses)
+    assert len(Contacts.load(contact_path(tmp_path, "default-right", "cube"))) == len(contacts)
     report = msgspec.json.decode((tmp_path / "live.json").read_bytes())
     assert report["counts"]["objects"] == sum(one.tracked for one in poses)
     assert report["object_latency_p50_ms"] > 0.0

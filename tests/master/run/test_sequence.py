@@ -153,5 +153,5 @@ def test_a_sender_that_went_on_while_this_machine_slept_is_taken_at_once() -> No
     counted.begin_session()
     assert counted.plausible(7, slept, t_ns + 2 * 10**9)
     assert counted.take(7, slept, 1, nothing_missing)
-    assert counted.sequence.lost == 0
+    assert counted.sequence.counts.lost == 0
     assert not counted.plausible(7, 2 * slept, t_ns + 3 * 10**9)

@@ -53,7 +53,7 @@ def palm_x(pose: HandPose) -> float:
 def with_change(run: SyntheticRun, setup: RigSetup, at: int) -> tuple[list[HandPose], LivePipeline]:
     """All poses of the run, the setup changed before message number `at` while messages go on."""
     pipeline = LivePipeline(run.setup, StageTimes())
-    builder = threading.Thread(target=pipeline.change, args=(setup,))
+    builder = threading.Thread(target=lambda: pipeline.prepare(setup)())
     poses: list[HandPose] = []
     for number, message in enumerate(run.messages):
         if number == at:
@@ -94,7 +94,7 @@ def test_an_imu_goes_on_in_the_new_pipeline_and_into_the_same_counts(exact_run: 
     pipeline = LivePipeline(setup, StageTimes())
     for number, message in enumerate(exact_run.messages[:60]):
         if number == 30:
-            pipeline.change(aside_setup := setup_of(aside(setup.rig)))
+            pipeline.prepare(aside_setup := setup_of(aside(setup.rig)))()
             assert aside_setup.imus == ("imu",)
         palm = hand_at(message.t_ns * 1e-9).T_rig_palm[:3, :3]
         pipeline.push_orientation(message.t_ns, matrix_to_quaternion(palm))
@@ -109,7 +109,7 @@ def test_stages_are_measured_once(exact_run: SyntheticRun) -> None:
     for message in exact_run.messages[:40]:
         count += len(pipeline.push(message))
     before = stages("filter").count
-    pipeline.change(exact_run.setup)
+    pipeline.prepare(exact_run.setup)()
     assert stages("filter").count == before == count
 
 
@@ -273,10 +273,9 @@ class Master:
             ("127.255.255.255", beacon),
             ("127.0.0.1", 0),
             endpoint,
+            self.files,
             2.0,
             folder / "poses.npz",
-            None,
-            self.files,
         )
         self.lines: list[str] = []
         args = ((setup,), key, settings, stop, self.lines.append)

@@ -30,7 +30,7 @@ from master.evaluation.score import ObjectTruth, errors
 from master.outputs.result_files import ObjectPoses
 from master.rig.pipeline import pipeline_of
 from master.rig.setup import RigSetup, load_setups, setups_of
-from master.run.app import Observed, RunFigures, StageTimes, health, run
+from master.run.app import RunFigures, StageTimes, health, observed, run
 from master.run.dispatcher import Dispatcher, TrackedObject
 from tests.master.outputs.test_outputs_files import random_pose
 from tests.master.run.test_app import Collector, ScriptedClock, ScriptedSource
@@ -93,7 +93,9 @@ def cube(root: Path) -> ObjectRun:
 def off(run: ObjectRun, pose: ObjectPose) -> tuple[float, float]:
     """Distance [mm] and angle [deg] from the truth."""
     T = run.pose(pose.object, pose.t_ns)
-    mm, deg = errors(ObjectPoses.of(pose.object, [pose]), ObjectTruth(np.array([pose.t_ns]), T[None]))
+    mm, deg = errors(
+        ObjectPoses.stacked([pose], object=pose.object), ObjectTruth(np.array([pose.t_ns]), T[None])
+    )
     return float(mm[0]), float(deg[0])
 
 
@@ -173,7 +175,7 @@ def test_the_loop_says_how_long_an_object_took_and_counts_it(wand: ObjectRun) ->
     watched: list[MarkerDetections] = []
     run(
         ScriptedSource([*wand.messages], stop).get,
-        Observed(world_of(wand.setup).push, figures.rates, watched.append).push,
+        observed(world_of(wand.setup).push, figures.rates, watched.append),
         [sink],
         clock,
         figures,
@@ -197,8 +199,8 @@ def test_tags_and_poses_of_trackers_are_no_frames(cube: ObjectRun) -> None:
     setup = with_tracker(cube.setup)
     script = [*cube.messages, tracker_pose("puck", cube.pose("cube", START_NS), 0, START_NS)]
     dispatcher = world_of(setup)
-    observed = Observed(dispatcher.push, figures.rates, lambda _frame: None)
-    run(ScriptedSource([*script], stop).get, observed.push, [], ScriptedClock(), figures, stop)
+    push = observed(dispatcher.push, figures.rates, lambda _frame: None)
+    run(ScriptedSource([*script], stop).get, push, [], ScriptedClock(), figures, stop)
     assert figures.rates.camera_hz == pytest.approx({"left": 60.0, "right": 60.0}, rel=1e-3)
 
 

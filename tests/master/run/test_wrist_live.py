@@ -17,7 +17,7 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration, l
 from common.clock import SystemClock
 from common.errors import CalibrationError
 from common.messages import Command, Health
-from master.outputs.poses import load_poses
+from master.outputs.poses import Poses
 from master.rig.setup import RigFiles, RigSetup, load_setup
 from master.run.app import StageTimes
 from master.run.live import LiveSettings, run_live
@@ -75,12 +75,12 @@ class Running:
 
 
 @contextmanager
-def running(setup: RigSetup, out: Path, files: RigFiles | None = None) -> Generator[Running, None, None]:
+def running(setup: RigSetup, out: Path, files: RigFiles) -> Generator[Running, None, None]:
     """A live master with one slave; both end with the block, and the results are in `out`."""
     key = bytes.fromhex(new_key())
     beacon, bus = free_udp_port(), free_endpoint()
     settings = LiveSettings(
-        ("127.255.255.255", beacon), ("127.0.0.1", 0), bus, 2.0, out / "poses.npz", out / "live.json", files
+        ("127.255.255.255", beacon), ("127.0.0.1", 0), bus, files, 2.0, out / "poses.npz", out / "live.json"
     )
     stop, lines = threading.Event(), list[str]()
     master = threading.Thread(target=run_live, args=((setup,), key, settings, stop, lines.append))
@@ -99,7 +99,7 @@ def running(setup: RigSetup, out: Path, files: RigFiles | None = None) -> Genera
 
 
 def test_a_master_tracks_a_wrist_device_and_says_how_it_is(root: Path, tmp_path: Path) -> None:
-    with running(wrist_setup(root), tmp_path) as run:
+    with running(wrist_setup(root), tmp_path, RigFiles(root / "calib_json", ("wrist",))) as run:
         run.send(40)
         run.camera.send(
             detections("wrist", run.camera.session, 400)
@@ -113,7 +113,7 @@ def test_a_master_tracks_a_wrist_device_and_says_how_it_is(root: Path, tmp_path:
         assert report.metrics["wrist.clock_sigma_us"] >= 0.0
         assert not [name for name in report.metrics if "phase" in name or "residual" in name]
     summary = json.loads((tmp_path / "live.json").read_text())
-    poses = load_poses(tmp_path / "poses.npz")
+    poses = Poses.load(tmp_path / "poses.npz")
     assert len(poses) == summary["poses"] > 30
     assert summary["lost"] == summary["skipped"] == 0
     assert summary["camera_hz"]["wrist"] == pytest.approx(3.0 * summary["received_hz"]["wrist"], rel=0.1)
@@ -130,7 +130,7 @@ def test_a_changed_palm_pose_is_used_while_it_tracks(tree: Path, tmp_path: Path)
         run.send(20)
         assert until(lambda: run.ask("report").counts["wrist.received"] == 40)
         assert run.ask("report").counts["reload.applied"] == 1
-    poses = load_poses(tmp_path / "poses.npz")
+    poses = Poses.load(tmp_path / "poses.npz")
     assert (np.diff(poses.t_ns) > 0).all()
     wrist_y = poses.position_m[:, 1, 1]
     assert wrist_y[-1] == pytest.approx(wrist_y[0] - 0.005, abs=1e-6)

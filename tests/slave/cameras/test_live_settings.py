@@ -17,7 +17,7 @@ from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
 from slave.cameras.settings import FrameObserver
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
-from slave.reconnect import Backoff, ReconnectingCamera
+from slave.reconnect import ReconnectingCamera
 from slave.sources import FrameSource
 from tests.network_helpers import until
 from tests.slave.cameras.test_real_cameras import CALIBRATION as FILE
@@ -246,7 +246,7 @@ def test_a_camera_that_comes_back_has_the_settings_it_was_given_last() -> None:
         FILE,
         SystemClock(),
         threading.Event(),
-        backoff=Backoff(first_s=0.001),
+        first_s=0.001,
     )
     with reading(source):
         source.tune(changed(exposure_us=9000.0))

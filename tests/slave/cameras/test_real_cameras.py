@@ -14,7 +14,7 @@ from slave.cameras.grey import Pixels
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
 from slave.cli.options import add_camera
 from slave.commands import devices
-from slave.reconnect import Backoff, ReconnectingCamera
+from slave.reconnect import ReconnectingCamera
 from slave.sources import FrameSource
 from tests.slave.fake_picamera2 import Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice
@@ -152,7 +152,7 @@ def test_an_unplugged_camera_comes_back_with_all_its_settings() -> None:
         CALIBRATION,
         clock,
         threading.Event(),
-        backoff=Backoff(first_s=0.001),
+        first_s=0.001,
     )
     seqs = [frame.seq for _ in range(6) if (frame := source.read()) is not None]
     assert len(seqs) == 6
@@ -173,7 +173,7 @@ def test_a_lost_grey_camera_comes_back_grey() -> None:
         CALIBRATION,
         clock,
         threading.Event(),
-        backoff=Backoff(first_s=0.001),
+        first_s=0.001,
     )
     shapes = [frame.image.shape for _ in range(4) if (frame := source.read()) is not None]
     source.close()

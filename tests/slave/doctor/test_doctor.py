@@ -331,9 +331,9 @@ UNIT = (
 def test_the_service_as_systemd_reports_it(
     tmp_path: Path, output: str, verdict: Verdict, runs: bool, text: str
 ) -> None:
-    unit = check_unit(machine(tmp_path, {"systemctl": Ran(0, output, "")}), "left")
-    assert (unit.finding.verdict, unit.runs) == (verdict, runs)
-    assert text in unit.finding.text
+    finding, has_device = check_unit(machine(tmp_path, {"systemctl": Ran(0, output, "")}), "left")
+    assert (finding.verdict, has_device) == (verdict, runs)
+    assert text in finding.text
 
 
 def test_what_is_installed_is_looked_at_by_itself(tmp_path: Path) -> None:

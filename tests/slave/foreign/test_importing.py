@@ -8,7 +8,7 @@ import pytest
 from common.errors import PhalanxError, RecordingError
 from common.recording.frame_recording import FrameRecording, open_recording
 from common.recording.pictures import FramePictures
-from slave.foreign.importing import Wish, import_pictures
+from slave.foreign.importing import import_pictures
 from slave.foreign.sources import read_times
 from tests.slave.foreign.foreign_videos import (
     COUNT,
@@ -23,13 +23,13 @@ from tests.slave.foreign.foreign_videos import (
 MS = 1_000_000
 
 
-def imported(tmp_path: Path, *paths: Path, **wish: object) -> tuple[FrameRecording, str]:
+def imported(tmp_path: Path, *paths: Path, **options: object) -> tuple[FrameRecording, str]:
     """The recording, and all that was said."""
     output: list[str] = []
     tree = tmp_path / "calib"
     if not tree.exists():
         write_tree(tree)
-    import_pictures(Wish(tree, paths, **wish), tmp_path / "out", output.append)  # type: ignore[arg-type]
+    import_pictures(tree, tmp_path / "out", output.append, paths, **options)  # type: ignore[arg-type]
     return open_recording(tmp_path / "out"), "\n".join(output)
 
 
@@ -276,7 +276,7 @@ def test_which_rig_is_meant_is_asked_where_several_could_be(tmp_path: Path) -> N
     videos = [write_video(tmp_path / f"{name}.avi") for name in ("left", "right")]
     with pytest.raises(RecordingError, match=r"which rig\? --rig desk or other"):
         imported(tmp_path, *videos)
-    recording, _ = imported(tmp_path, *videos, rig="other")
+    recording, _ = imported(tmp_path, *videos, rig_name="other")
     assert recording.manifest.marker_rig().name == "other"
 
 

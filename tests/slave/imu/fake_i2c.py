@@ -3,8 +3,9 @@
 import struct
 from collections import deque
 from errno import EREMOTEIO
+from typing import cast
 
-from smbus2 import i2c_msg
+from smbus2 import SMBus, i2c_msg
 
 from slave.imu.lsm6dsox import Register
 
@@ -35,11 +36,11 @@ class FakeLsm6dsox:
         self.overrun = False
         self.temperature = 0
 
-    def __call__(self, bus: int) -> "FakeLsm6dsox":
+    def __call__(self, bus: int) -> SMBus:
         """Open the bus."""
         assert bus == 1
         self.opened += 1
-        return self
+        return cast(SMBus, self)
 
     def close(self) -> None:
         """Give the bus back."""

@@ -9,7 +9,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from common.bus.bus import LoopbackBus
 from common.calibration import ImuCalibration, RigCalibration, load, save
 from common.clock import SystemClock
 from common.errors import ImuError
@@ -20,6 +19,7 @@ from slave.report import Reporter, imu_counters
 from slave.sender import ImuPipeline, run, skip_one, wait_for_start
 from slave.sources import Reporting
 from slave.uplink import Uplink
+from tests.memory_bus import LoopbackBus
 from tests.network_helpers import until
 
 ROOT = Path(__file__).resolve().parents[3]

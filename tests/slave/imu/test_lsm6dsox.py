@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from smbus2 import SMBus
 
 from common.clock import Clock
 from common.errors import ImuError
@@ -153,7 +154,7 @@ def test_the_impossible_is_reported() -> None:
     with pytest.raises(ImuError, match=r"I2C bus 99, address 0x6a: there is no /dev/i2c-99: is I2C on\?"):
         Lsm6dsoxImu("imu", I2cPlace(99), 120.0, Dispatcher(part), threading.Event())
 
-    def forbidden(_bus: int) -> FakeLsm6dsox:
+    def forbidden(_bus: int) -> SMBus:
         raise PermissionError(13, "Permission denied")
 
     with pytest.raises(ImuError, match="usermod -aG i2c"):

@@ -172,7 +172,7 @@ def test_a_setting_that_older_devices_lack_is_only_reported(
     device.unplug()
 
 
-def test_ports_that_cannot_be_opened_are_reported(tmp_path: Path) -> None:
+def test_ports_that_cannot_be_opened_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ImuError, match=r"nowhere cannot be opened: there is no such port; .* --ports"):
         opened(tmp_path / "nowhere")
     locked = FakeXimu3(tmp_path / "locked")
@@ -188,8 +188,9 @@ def test_ports_that_cannot_be_opened_are_reported(tmp_path: Path) -> None:
     def forbidden(_place: SerialPlace) -> None:
         raise PermissionError(13, "Permission denied")
 
+    monkeypatch.setattr("slave.imu.ximu3.open_port", forbidden)
     with pytest.raises(ImuError, match="dialout"):
-        Ximu3Imu("imu", SerialPlace("/dev/x"), 120.0, CLOCK, threading.Event(), forbidden)  # type: ignore[arg-type]
+        opened(tmp_path / "x")
 
 
 @pytest.mark.parametrize(

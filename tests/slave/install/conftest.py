@@ -137,7 +137,7 @@ class Board:
         plan = plan_of(
             options, calibration_of(calibration or ROOT / "calib_json"), keys_of(self.keys if keys else None)
         )
-        source = Source(None, site)
+        source = Source(site, wheels=False)
         return steps.install(plan, source, source.name(), self.machine, dry_run)
 
     def files(self) -> dict[str, str]:

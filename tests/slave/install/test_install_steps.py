@@ -160,7 +160,7 @@ def test_a_version_that_hangs_is_taken_back_by_what_the_one_before_needed(
 def test_the_release_that_the_installer_runs_from_is_not_made_again(board: Board, site: Path) -> None:
     name = board.install(site).release
     inside = Path("/") / release.RELEASES / name / "lib/python3.13/site-packages"
-    assert Source(None, inside).name() == name
+    assert Source(inside, wheels=False).name() == name
 
 
 def test_what_does_not_run_is_taken_back_and_says_why(board: Board, site: Path, tmp_path: Path) -> None:
@@ -323,7 +323,7 @@ def test_a_release_that_was_half_removed_is_made_again(
         patch.setattr(release.shutil, "rmtree", _nothing)  # the power goes
         release.remove(board.root, name)
     assert not (board.root / release.RELEASES / name).exists()
-    assert release.make(board.root, name, Source(None, site), board.output.append)
+    assert release.make(board.root, name, Source(site, wheels=False), board.output.append)
 
 
 def _nothing(_path: Path, ignore_errors: bool = False) -> None:

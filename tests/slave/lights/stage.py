@@ -32,6 +32,13 @@ class SetClock(Clock):
         return self.t_ns
 
 
+class StageClock(SetClock):
+    """A clock that moves when somebody sleeps, too."""
+
+    def sleep(self, seconds: float) -> None:
+        self.t_ns += max(round(seconds * 1e9), 1)
+
+
 class NotedLights(Lights):
     """`Lights` that note when they were switched; each switching takes `takes_ns`, and fails while `fails`."""
 
@@ -45,9 +52,6 @@ class NotedLights(Lights):
             raise LightsError("unplugged")
         self.clock.t_ns += self.takes_ns
         self.switched.append((self.clock.t_ns, lit))
-
-    def off(self) -> None:
-        self.switch(AMBIENT)
 
     def close(self) -> None:
         if not self.closed and not self.fails:

@@ -1,4 +1,4 @@
-"""The strober lights every frame by its kind and no other; late wake-ups, stalls, failing drivers leave frames dark."""
+"""The strobe lights every frame by its kind and no other; late wake-ups, stalls, failing drivers leave frames dark."""
 
 import threading
 import time
@@ -8,7 +8,7 @@ import pytest
 
 from common.clock import SystemClock
 from common.recording.frame_recording import Illumination
-from slave.lights.controller import CYCLE, FAILED_NS, LEAST, StrobeController, Strober, StrobeSchedule
+from slave.lights.controller import CYCLE, FAILED_NS, LEAST, Strobe, StrobeController, StrobeSchedule
 from slave.lights.interlock import WINDOW_NS, Interlock
 from tests.slave.lights.stage import (
     AMBIENT,
@@ -30,32 +30,30 @@ HANDED_OVER_NS = 15 * MS  # after its stamp a frame arrives
 
 
 class Stage:
-    """Strober, schedule, guard and driver on a clock of their own, and a camera whose frames arrive late."""
+    """Strobe, schedule, guard and driver on a clock of their own, and a camera whose frames arrive late."""
 
     def __init__(self, takes_ns: int = 0, late: Lateness = lambda: 0) -> None:
         self.clock = SetClock(stamp(0))
         self.lights = NotedLights(self.clock, takes_ns)
         self.interlock = Interlock(self.lights, STROBE, self.clock, watch=False)
-        self.schedule = StrobeSchedule(90.0, 2000.0, 1000.0)
-        self.strober = Strober(self.schedule, self.interlock, self.clock)
+        self.strobe = Strobe(StrobeSchedule(90.0, 2000.0, 1000.0), self.interlock, self.clock)
         self.late = late
 
     def run(self, frames: range, jitter_ns: float = 0.0, seed: int = 0, lost: float = 0.0) -> None:
-        """Let these frames be taken; each is pushed when it arrives, and the strober stepped when it asked for it."""
+        """Let these frames be taken; each is pushed when it arrives, and the strobe stepped when it asked for it."""
         rng = np.random.default_rng(seed)
-        again = self.strober.step()
+        again = self.strobe.step()
         for k in frames:
             again = self._until(stamp(k) + HANDED_OVER_NS, again)
             if rng.random() >= lost:
-                if self.schedule.push(k, stamp(k, jitter_ns, rng)):
-                    self.strober.renumber()
-                again = self.strober.step()
+                self.strobe.push(k, stamp(k, jitter_ns, rng))
+                again = self.strobe.step()
         self._until(stamp(frames[-1]) + HANDED_OVER_NS, again)
 
     def _until(self, end_ns: int, again: int | None) -> int | None:
         while again is not None and again + (late := self.late()) <= end_ns:
             self.clock.t_ns = max(again + late, self.clock.t_ns)
-            again = self.strober.step()
+            again = self.strobe.step()
         self.clock.t_ns = max(end_ns, self.clock.t_ns)
         return again
 
@@ -71,7 +69,7 @@ def test_every_frame_is_lit_as_the_cycle_says() -> None:
     stage = Stage()
     stage.run(range(60))
     assert [stage.kind(k) for k in range(20, 58)] == [CYCLE[k % 3] for k in range(20, 58)]
-    assert stage.strober.counts == {"skipped": 0, "late": 0}
+    assert stage.strobe.missed == {"skipped": 0, "late": 0}
     assert stage.interlock.counts["refused"] == 0
 
 
@@ -93,7 +91,7 @@ def test_who_wakes_up_late_leaves_frames_dark_and_lights_no_other(seed: int) -> 
     dark = sum(kind is not right for kind, right in zip(illuminations, wanted, strict=True))
     assert 10 < dark < 150
     assert (
-        abs(stage.strober.counts["skipped"] - dark) <= 6
+        abs(stage.strobe.missed["skipped"] - dark) <= 6
     )  # the first frames after the start, and the last ones
     longest = max(stop - start for _, start, stop in stage.lights.pulses())
     assert longest < PERIOD_NS  # even without the watchdog
@@ -102,7 +100,7 @@ def test_who_wakes_up_late_leaves_frames_dark_and_lights_no_other(seed: int) -> 
 def test_a_driver_that_takes_too_long_is_darkened_before_the_frame_is_over() -> None:
     stage = Stage(takes_ns=round(1.2 * MS))
     stage.run(range(40))
-    assert stage.strober.counts["late"] > 10
+    assert stage.strobe.missed["late"] > 10
     assert all(stop - start <= 1.3 * MS for _, start, stop in stage.lights.pulses())
 
 
@@ -120,14 +118,14 @@ def test_a_stall_goes_dark_and_the_return_is_lit_again() -> None:
     assert [stage.kind(k) for k in range(415, 428)] == [CYCLE[k % 3] for k in range(415, 428)]
 
 
-def test_dark_ends_a_pulse_at_once() -> None:
+def test_a_stall_ends_a_pulse_at_once() -> None:
     stage = Stage()
     stage.run(range(25))
     while stage.lights.lit is AMBIENT:
-        again = stage.strober.step()
+        again = stage.strobe.step()
         assert again is not None
         stage.clock.t_ns = again
-    stage.strober.dark()
+    stage.strobe.stalled()
     assert stage.lights.lit is AMBIENT
 
 

@@ -12,7 +12,7 @@ from common.sim.wrist.scene import WristScene
 from slave.__main__ import main
 from slave.cameras.synthetic import SyntheticCamera
 from slave.commands.simulated import scene_of
-from slave.lights.strobed import SimulatedStrobe, StrobedCamera, SyntheticLights, Timeline, schedule_of
+from slave.lights.strobed import SimulatedStrobe, StrobedCamera, SyntheticLights, schedule_of
 from slave.sources import Frame
 from slave.wrist.strobe import Strobe
 from tests.slave.lights.stage import (
@@ -27,14 +27,8 @@ from tests.slave.lights.stage import (
     STROBE,
     Lateness,
     SetClock,
+    StageClock,
 )
-
-
-class StageClock(SetClock):
-    """A clock that moves when somebody sleeps."""
-
-    def sleep(self, seconds: float) -> None:
-        self.t_ns += max(round(seconds * 1e9), 1)
 
 
 @pytest.fixture(scope="module")
@@ -86,17 +80,12 @@ def test_late_and_skipped_pulses_cost_cycles_and_make_no_wrong_one(scene: WristS
 
 
 def test_a_light_that_smears_into_the_next_frame_is_seen_there(scene: WristScene) -> None:
-    # What the strober never does: the timeline and the camera show it all the same.
-    class Smeared:
-        def __init__(self) -> None:
-            self.timeline = Timeline()
-
-        def during(self, start_ns: int, stop_ns: int) -> object:
-            return self.timeline.during(start_ns, stop_ns)
-
-    clock, lights = StageClock(), Smeared()
-    lights.timeline.add(FIRST_NS - 2 * MS, LASER)
-    lights.timeline.add(FIRST_NS + 11 * MS, AMBIENT)  # frame 1 is exposed from 10.1 to 12.1 ms
+    # What the strobe never does: the lights and the camera show it all the same.
+    clock, switching = StageClock(), SetClock(FIRST_NS - 2 * MS)
+    lights = SyntheticLights(switching)
+    lights.switch(LASER)
+    switching.t_ns = FIRST_NS + 11 * MS  # frame 1 is exposed from 10.1 to 12.1 ms
+    lights.off()
     source = SyntheticCamera(scene, "wrist", FIRST_NS, clock, 0, clock, clock.sleep, lights)  # type: ignore[arg-type]
     first, second, third = (source.read() for _ in range(3))
     assert first is not None
@@ -109,21 +98,21 @@ def test_a_light_that_smears_into_the_next_frame_is_seen_there(scene: WristScene
     assert 0.3 < smear[line > 100].mean() / line[line > 100].mean() < 0.9
 
 
-def test_the_timeline_gives_shares_of_an_exposure() -> None:
-    clock, timeline = SetClock(1000), Timeline()
-    lights = SyntheticLights(timeline, clock)
-    assert timeline.during(0, 100).mostly is AMBIENT
+def test_the_lights_give_shares_of_an_exposure() -> None:
+    clock = SetClock(1000)
+    lights = SyntheticLights(clock)
+    assert lights.during(0, 100).mostly is AMBIENT
     for t_ns, lit in ((1000, LASER), (1300, AMBIENT), (1400, LED), (1900, LASER)):
         clock.t_ns = t_ns
         lights.switch(lit)
-    seen = timeline.during(1200, 2200)
+    seen = lights.during(1200, 2200)
     assert (seen.laser, seen.led) == (pytest.approx(0.4), pytest.approx(0.5))
     assert seen.mostly is LED
     clock.t_ns = 2000
     lights.close()
     clock.t_ns = 3000
     lights.switch(LED)
-    assert timeline.during(2500, 4000) == type(seen)(0.0, 0.0)
+    assert lights.during(2500, 4000) == type(seen)(0.0, 0.0)
 
 
 def test_the_lights_follow_the_exposure_and_refuse_one_that_is_too_long(scene: WristScene) -> None:

@@ -8,8 +8,9 @@ import pytest
 from msgspec.structs import replace
 
 from common.calibration import CameraCalibration
+from common.messages import MarkerDetections
 from slave import live
-from slave.markers.detector import MarkerDetector
+from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.engine import NUMPY
 from slave.markers.reloadable import CalibratedDetector, LightAdaptiveDetector, ReloadableDetector
 from tests.slave import painted
@@ -37,7 +38,7 @@ def test_those_that_are_known_are_seen_as_ever_and_the_others_never() -> None:
 def test_without_any_colour_nothing_is_seen_and_with_the_last_one_all_are() -> None:
     detector = ReloadableDetector(CalibratedDetector(replace(painted.camera(), markers=None), painted.NAMES))
     assert np.isnan(detector.push(PICTURE, 0).uv).all()
-    assert (detector.missing, detector.plain, detector.log_gains.tolist()) == (painted.NAMES, None, [0, 0, 0])
+    assert (detector.missing, detector.plain, detector.adaptive) == (painted.NAMES, None, None)
     some = CalibratedDetector(knowing("thumb", "index", "middle"), painted.NAMES)
     detector.replace(some)
     assert np.isfinite(detector.push(PICTURE, FRAME_NS).uv[:, 0]).tolist() == 3 * [True] + 3 * [False]
@@ -66,6 +67,11 @@ def test_what_is_made_of_a_file_says_what_is_missing(
         made = make(replace(FILE, markers=None), RIG)
     assert isinstance(made, CalibratedDetector)
     assert f"{files.camera_path}: markers: no colour for thumb, index, " in caplog.text
-    assert live._uncalibrated(("ring",)) == {"uncalibrated": 1, "uncalibrated.ring": 1}
-    assert live._uncalibrated(()) == {"uncalibrated": 0}
     assert isinstance(make(FILE, RIG), LightAdaptiveDetector)
+
+
+def test_a_frame_without_markers_is_a_message_in_which_nothing_is_seen() -> None:
+    found = Detections.none(6)
+    seen = found.uv, found.area, found.quality, found.sigma_px, found.alt_uv
+    assert np.isnan(MarkerDetections("left", 1, 2, 0, 0, *seen).uv).all()
+    assert found.colour.shape == (6, 3)

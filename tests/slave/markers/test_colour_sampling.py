@@ -17,9 +17,10 @@ from common.geometry.srgb import gain_tables
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from slave.live import ColourSampler
-from slave.markers.classify import in_range
-from slave.markers.colours import SampledColours, calibrate, hue_separation, undone
+from slave.markers.classify import hue_distance, in_range
+from slave.markers.colours import SampledColours, calibrate, hsv_of
 from slave.markers.detector import MarkerDetector
+from slave.markers.illuminant import undone
 from slave.markers.reloadable import (
     CalibratedDetector,
     LightAdaptiveDetector,
@@ -43,7 +44,7 @@ def picked(
 ) -> dict[str, HsvRange]:
     colours, found = SampledColours(), dict(ranges or {})
     for name in names:
-        found = colours.sample(image, log_gains, name, AT[name], found).ranges
+        found, _ = colours.sample(image, log_gains, name, AT[name], found)
     return found
 
 
@@ -55,10 +56,9 @@ def test_six_clicks_detect_as_well_as_the_calibrated_ranges() -> None:
         image, truth = renderer.render(0.3), renderer.markers(0.3)
         colours, ranges = SampledColours(), dict[str, HsvRange]()
         for name, uv in zip(RIG.markers, truth.uv, strict=True):
-            sample = colours.sample(image, SAME, name, (uv[0] + 2.0, uv[1] - 2.0), ranges)
-            ranges = sample.ranges
-            assert sample.row.own > 0.95
-            assert (sample.row.skin, sample.row.background_px) == (0.0, 0.0)
+            ranges, row = colours.sample(image, SAME, name, (uv[0] + 2.0, uv[1] - 2.0), ranges)
+            assert row.own > 0.95
+            assert (row.skin, row.background_px) == (0.0, 0.0)
         files = CAMERAS[camera], replace(CAMERAS[camera], markers=ranges)
         detectors = [MarkerDetector(file, RIG.markers) for file in files]
         for k in range(20):
@@ -89,8 +89,8 @@ def test_a_click_next_to_a_small_marker_is_meant_for_it() -> None:
     straight = picked(PICTURE, "index")["index"]
     u, v = AT["index"]
     for du, dv in ((7.0, -6.0), (0.0, -15.0), (-6.9, 0.0)):  # in the picture, beside it, on its rim
-        off_centre = SampledColours().sample(PICTURE, SAME, "index", (u + du, v + dv), {}).ranges["index"]
-        np.testing.assert_allclose(off_centre.hsv_low, straight.hsv_low, atol=2)
+        off_centre, _ = SampledColours().sample(PICTURE, SAME, "index", (u + du, v + dv), {})
+        np.testing.assert_allclose(off_centre["index"].hsv_low, straight.hsv_low, atol=2)
 
 
 @pytest.mark.parametrize(
@@ -140,9 +140,9 @@ def test_a_range_of_the_file_gives_up_the_hues_that_a_picked_one_needs() -> None
 
 def test_a_range_that_was_set_by_hand_since_is_not_made_again() -> None:
     colours = SampledColours()
-    ranges = colours.sample(PICTURE, SAME, "index", AT["index"], {}).ranges
+    ranges, _ = colours.sample(PICTURE, SAME, "index", AT["index"], {})
     mine = replace(ranges["index"], hsv_low=(60, 111, 99))
-    again = colours.sample(PICTURE, SAME, "little", AT["little"], {"index": mine}).ranges
+    again, _ = colours.sample(PICTURE, SAME, "little", AT["little"], {"index": mine})
     assert again["index"] == mine
 
 
@@ -154,8 +154,8 @@ def test_under_another_light_a_colour_is_picked_as_under_that_of_calibration() -
     )
     np.testing.assert_allclose(back.hsv_low, plain.hsv_low, atol=2)
     astray = picked(other, "ring")["ring"]
-    assert hue_separation(astray.hsv_low[0], plain.hsv_low[0]) > 3, "the light does matter"
-    assert in_range(undone(other, gains), plain)[int(AT["ring"][1]), int(AT["ring"][0])]
+    assert hue_distance(astray.hsv_low[0], plain.hsv_low[0]) > 3, "the light does matter"
+    assert in_range(hsv_of(undone(other, gains)), plain)[int(AT["ring"][1]), int(AT["ring"][0])]
 
 
 def test_from_no_colour_at_all_to_a_slave_that_follows_the_light(tmp_path: Path) -> None:
@@ -195,7 +195,7 @@ def test_from_no_colour_at_all_to_a_slave_that_follows_the_light(tmp_path: Path)
         detector.push(moved, (2 * k + 1) * 16_666_667)
         found = detector.push(moved, (2 * k + 2) * 16_666_667).uv
         assert np.isfinite(found[:, 0]).sum() == k + 1
-    assert detector.adapts
+    assert detector.adaptive is not None
     assert load(files.camera_path, CameraCalibration) == bare, "not asked to save"
     commands["save"]("")
     saved = load(files.camera_path, CameraCalibration)

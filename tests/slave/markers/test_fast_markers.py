@@ -119,7 +119,7 @@ def test_what_is_measured_is_the_same(numba: Engine, name: str) -> None:
 def test_blobs_and_codes_are_the_same_on_every_grid(numba: Engine, name: str) -> None:
     seen = 0
     for pushed, image, _ in frames(name):
-        table = pushed._table
+        table = pushed.table
         for grid in ((4, 0, 0), (2, 0, 0), (4, 2, 2), (4, 0, 2), (4, 3, 3)):
             codes = table.scan(image, *grid)
             fast_codes, fast = numba.scan_blobs(image, table, table.bits, *grid, None)

@@ -16,8 +16,9 @@ import pytest
 from common.sim.light import LightSchedule
 from common.sim.render import Renderer
 from slave.markers.detector import MarkerDetector
+from slave.markers.illuminant import apart
 from slave.markers.reloadable import REFUSE, LightAdaptiveDetector, can_adapt, detector_for
-from slave.markers.white_balance import Inline, apart
+from slave.markers.white_balance import Inline
 from tests.slave import painted
 from tests.slave.light_courses import (
     CANDLE,
@@ -116,7 +117,7 @@ def test_while_the_colours_are_behind_nothing_is_reported() -> None:
     assert seen[20:28] == [0] * 8  # the lamp was switched at frame 20
     assert min(seen[29:]) >= 5
     assert detector.refused == 16
-    assert apart(detector.log_gains, np.log(schedule.gains_bgr(OPEN_S + 2.0))) < 0.1
+    assert apart(detector.log_gains, np.log(schedule.at(OPEN_S + 2.0).gains_bgr())) < 0.1
 
 
 def test_it_says_that_a_light_is_not_known_and_what_to_do() -> None:

@@ -20,7 +20,7 @@ from slave.commands.offline import calibrate_colours, camera_of
 from slave.markers.classify import MAX_CANDIDATES, SCALE, Blob, ColourTable
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.engine import NUMPY, Engine, engine_named
-from slave.markers.reloadable import LightAdaptiveDetector, detector_for, plain_of
+from slave.markers.reloadable import LightAdaptiveDetector, detector_for
 from slave.markers.scan import STRIPS, Scanner, merged
 from slave.markers.track import Window
 from slave.markers.white_balance import Inline
@@ -92,9 +92,7 @@ def test_every_marker_of_a_recording_is_where_whole_frames_show_it(
         for k, row in enumerate(recording.frames_of(side)):
             if k and not recording.manifest.continuous:
                 whole, windows = whole.fresh(), windows.fresh()
-            plain = plain_of(windows)
-            assert plain is not None
-            plain.windows_only = True
+            windows.plain.windows_only = True
             image = read_png(recording.folder / row.file, (model.height_px, model.width_px))
             one, other = whole.push(image, row.t_ns), windows.push(image, row.t_ns)
             same += assert_same(one, other)

@@ -16,11 +16,11 @@ from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections, Message, TagDetections
 from common.recording.frame_recording import FrameRow, Illumination
-from slave.markers.reloadable import NullDetector
+from slave.markers.detector import Detections
 from slave.report import DetectionCounters
 from slave.sender import MarkerPipeline, run
 from slave.sources import Frame
-from slave.tags.offline import SHARE, LiveTags, Pace, TagCollector, finder_of, tagged_objects
+from slave.tags.offline import SHARE, LiveTags, SearchBudget, TagCollector, finder_of, tagged_objects
 
 ROOT = Path(__file__).resolve().parents[3]
 FILE = load(ROOT / "calib_json/cameras/left.json", CameraCalibration)
@@ -62,7 +62,12 @@ def test_the_tags_of_a_frame_follow_its_markers() -> None:
     run(
         wire,
         MarkerPipeline(
-            "left", wire.session, wire.send, NullDetector(len(RIG.markers)).push, counters, tags=tags.push
+            "left",
+            wire.session,
+            wire.send,
+            lambda _image, _t_ns: Detections.none(len(RIG.markers)),
+            counters,
+            tags=tags.push,
         ),
         threading.Event(),
     )
@@ -101,11 +106,11 @@ def test_another_finder_takes_over() -> None:
 @pytest.mark.parametrize(("markers_ms", "search_ms", "each"), [(2, 3, 1), (5, 3, 1), (5, 8, 3), (8, 3, 25)])
 def test_markers_and_tags_stay_within_their_share(markers_ms: int, search_ms: int, each: int) -> None:
     # At 100 Hz 8 of 10 ms may be used: of 5 for the markers 3 are left, a search of 8 fits in every third frame.
-    pace, searched = Pace(100.0), 0
+    budget, searched = SearchBudget(100.0), 0
     for k in range(300):
-        if pace.grants(10 * k * MS, markers_ms * MS):
+        if budget.grants(10 * k * MS, markers_ms * MS):
             searched += 1
-            pace.took(search_ms * MS)
+            budget.took(search_ms * MS)
     used_ms = markers_ms * 300 + search_ms * searched
     if markers_ms < 10 * SHARE:
         assert used_ms <= 300 * 10 * SHARE + search_ms
@@ -115,24 +120,24 @@ def test_markers_and_tags_stay_within_their_share(markers_ms: int, search_ms: in
 
 def test_markers_that_take_all_the_time_leave_tags_four_searches_a_second() -> None:
     # 15 of 16.7 ms for a minute, then 5 of them: no debt is left, and every frame is searched again soon.
-    pace, busy, idle = Pace(60.0), 0, 0
+    budget, busy, idle = SearchBudget(60.0), 0, 0
     for k in range(3660):
         spent_ms = 15 if k < 3600 else 5
-        if pace.grants(round(k * 1e9 / 60), spent_ms * MS):
+        if budget.grants(round(k * 1e9 / 60), spent_ms * MS):
             busy, idle = (busy + 1, idle) if k < 3600 else (busy, idle + 1)
-            pace.took(4 * MS)
+            budget.took(4 * MS)
     assert 60 * 4 - 20 <= busy <= 60 * 4 + 1
     assert idle >= 55
 
 
 def test_frames_that_come_rarely_are_all_searched() -> None:
     # A camera of 60 Hz whose slave sees every sixth frame has the time of all six.
-    pace = Pace(60.0)
+    budget = SearchBudget(60.0)
     searched = 0
     for k in range(100):
-        if pace.grants(100 * k * MS, 30 * MS):
+        if budget.grants(100 * k * MS, 30 * MS):
             searched += 1
-            pace.took(20 * MS)
+            budget.took(20 * MS)
     assert searched >= 99
 
 

@@ -1,11 +1,7 @@
 """The synthetic camera of a wrist device: lit in turn, and a slow process loses whole cycles of the strobe."""
 
-from pathlib import Path
-
 import numpy as np
 
-from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.clock import Clock
 from common.recording.frame_recording import Illumination
 from common.sim.board import BoardScene
 from common.sim.wrist.render import WristRenderer
@@ -13,26 +9,10 @@ from common.sim.wrist.scene import WristScene
 from slave.cameras.synthetic import SyntheticCamera
 from slave.commands.simulated import scene_of
 from slave.sources import Frame
+from tests.slave.lights.stage import StageClock
+from tests.slave.wrist.wrist_frames import CAMERA, PERIOD_NS, RIG, ROOT
 
-ROOT = Path(__file__).resolve().parents[3]
-RIG = load(ROOT / "calib_json/rigs/wrist.json", RigCalibration)
-CAMERAS = {"wrist": load(ROOT / "calib_json/cameras/wrist.json", CameraCalibration)}
-HAND = load(ROOT / f"calib_json/hands/{RIG.hand}.json", HandProfile)
-PERIOD_NS = 1e9 / CAMERAS["wrist"].frame_rate_hz
 EPOCH_NS = 5_000_000_000_000
-
-
-class StageClock(Clock):
-    """A true clock that moves only when somebody sleeps or the test says so."""
-
-    def __init__(self, t_ns: int) -> None:
-        self.t_ns = t_ns
-
-    def now_ns(self) -> int:
-        return self.t_ns
-
-    def sleep(self, seconds: float) -> None:
-        self.t_ns += max(round(seconds * 1e9), 1)
 
 
 def camera(clock: StageClock, scene: WristScene | BoardScene) -> SyntheticCamera:
@@ -92,7 +72,7 @@ def test_it_joins_with_the_first_frame_of_a_cycle() -> None:
 
 
 def test_a_board_before_it_is_grey_too() -> None:
-    source = camera(StageClock(EPOCH_NS - 1), BoardScene(RIG, CAMERAS, 7))
+    source = camera(StageClock(EPOCH_NS - 1), BoardScene(RIG, {"wrist": CAMERA}, 7))
     frame = read(source)
     assert frame.image.shape == (480, 640)
     assert frame.image.std() > 10.0

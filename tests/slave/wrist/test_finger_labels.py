@@ -10,7 +10,7 @@ from common.sim.wrist.render import WristRenderer
 from slave.cameras.synthetic import STROBE
 from slave.wrist.laser import finger_labels, laser_lines, separate
 from slave.wrist.led_image import WristView
-from slave.wrist.runs import NONE, line_runs
+from slave.wrist.runs import NONE, lines
 from slave.wrist.strobe import lit
 from slave.wrist.workspace import workspace_of
 from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW, scene
@@ -49,16 +49,18 @@ def test_seams_that_lie_one_finger_aside_do_not_move_the_line() -> None:
     renderer = WristRenderer(scene("spread@indoor", 61), "wrist", 2)
     ambient, laser, led = (renderer.render(1.0, kind) for kind in STROBE)
     workspace = workspace_of(VIEW)
-    runs = line_runs(lit(laser, ambient), workspace.first_row)
+    runs, _ = lines(lit(laser, ambient), workspace.first_row)
     points = np.stack([runs.column, runs.row], axis=-1, dtype=np.float64)
     finger = separate(lit(led, ambient), VIEW).finger_of(points)
-    whose = finger_labels(finger, runs, points, workspace)
+    palm_points = workspace.before_palm(points, VIEW.T_camera_palm)
+    at = workspace.palm.beyond_m(palm_points), workspace.palm.place(palm_points)
+    whose = finger_labels(finger, runs, *at, flexed=False)
     assert np.unique(whose[whose > 0]).tolist() == [1, 2, 3, 4]
     aside = np.where(finger > 0, finger + 1, finger)
     aside[finger == 4] = NONE
     assert (aside != whose)[whose > 0].mean() > 0.9
     kept = (whose > 0) & (finger != 4)
-    assert (finger_labels(aside, runs, points, workspace) == whose)[kept].mean() > 0.9
+    assert (finger_labels(aside, runs, *at, flexed=False) == whose)[kept].mean() > 0.9
 
 
 @pytest.mark.parametrize("t", [4.9, 5.1, 17.0])

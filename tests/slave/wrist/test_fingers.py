@@ -87,7 +87,7 @@ def test_a_crease_between_touching_fingers_is_the_seam() -> None:
     image = np.zeros_like(BLACK)
     crease = search_bands.middle[0] + 0.3 * search_bands.half[0]
     for k, u in enumerate(crease.tolist()):
-        row = int(search_bands.row + 10.0 * k)
+        row = int(search_bands.rows[k])
         cv2.rectangle(image, (int(u) - 45, row - 5), (int(u) + 45, row + 5), 120, -1)
         cv2.rectangle(image, (int(u) - 3, row - 5), (int(u) + 3, row + 5), 60, -1)
     found = separate(image, VIEW).seams[0]

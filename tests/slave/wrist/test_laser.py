@@ -11,7 +11,7 @@ from common.recording.frame_recording import Illumination
 from common.sim.wrist.render import WristRenderer
 from slave.cameras.synthetic import STROBE
 from slave.wrist.laser import laser_lines, separate
-from slave.wrist.runs import line_runs
+from slave.wrist.runs import lines
 from slave.wrist.strobe import lit
 from slave.wrist.workspace import workspace_of
 from tests.slave.wrist.wrist_frames import VIEW, scene
@@ -37,7 +37,7 @@ def test_rows_are_exact_to_parts_of_a_pixel_dim_or_saturated(peak: float) -> Non
     def row(u: Float) -> Float:
         return 300.3 + 0.21 * (u - 300.0)
 
-    runs = line_runs(drawn(row, (280, 330), peak), 200)
+    runs, _ = lines(drawn(row, (280, 330), peak), 200)
     np.testing.assert_array_equal(runs.column, np.arange(280, 331))
     errors = runs.row - row(runs.column.astype(np.float64))
     assert np.sqrt(np.mean(errors**2)) < 0.12
@@ -48,7 +48,7 @@ def test_a_jump_ends_a_line() -> None:
     def row(u: Float) -> Float:
         return np.where(u < 300, 290.0, 310.0)
 
-    runs = line_runs(drawn(row, (280, 320), 200.0), 200)
+    runs, _ = lines(drawn(row, (280, 320), 200.0), 200)
     broken = runs.column[[*(runs.first[1:] - 1), -1]]
     assert 320 in broken
     assert np.isin(broken, [299, 300, 320]).all()

@@ -12,7 +12,7 @@ from slave.__main__ import main
 from slave.report import DetectionCounters
 from slave.sender import DARK_AFTER, WristPipeline, run
 from slave.sources import Frame
-from slave.wrist.detector import NullWristDetector, WristDetector, WristFound
+from slave.wrist.detector import WristDetector, WristFound
 from slave.wrist.fingertips import Fingertips
 from slave.wrist.laser import LaserLines
 from slave.wrist.strobe import StrobeCycle
@@ -101,7 +101,7 @@ def test_while_there_are_no_cycles_every_frame_is_shown_and_nothing_is_sent() ->
             "wrist",
             wire.session,
             wire.send,
-            NullWristDetector().push,
+            lambda _frame: None,
             counters,
             lambda frame: shown.append(frame.seq),
         ),
@@ -120,11 +120,7 @@ def test_the_time_of_a_cycle_is_that_of_its_three_frames_however_long_there_was_
     counters = DetectionCounters(NAMES)
     # 300 frames of which none is the last of a triple: nobody before the device.
     source = Source(frames([*(3 * k for k in range(300)), 900, 901, 902]))
-    run(
-        source,
-        WristPipeline("wrist", 77, Wire().send, ByNumber().push, counters),
-        threading.Event(),
-    )
+    run(source, WristPipeline("wrist", 77, Wire().send, ByNumber().push, counters), threading.Event())
     metrics = counters.metrics()
     assert (metrics["detect_us"], metrics["detect_worst_us"]) == (3000.0, 3000.0)
 

@@ -71,8 +71,5 @@ def _showing(place: Frame, picture: Frame) -> Frame:
 def _later(frame: Frame, frames: int) -> Frame:
     late_ns = round(frames * PERIOD_NS)
     return replace(
-        frame,
-        seq=frame.seq + frames,
-        t_ns=frame.t_ns + late_ns,
-        ready_t_ns=frame.ready_t_ns + late_ns,
+        frame, seq=frame.seq + frames, t_ns=frame.t_ns + late_ns, ready_t_ns=frame.ready_t_ns + late_ns
     )

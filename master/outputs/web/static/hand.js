@@ -220,7 +220,6 @@ export class HandView {
       hand = this._newHand(name, message);
     }
     hand.rig.pose(message.joints);
-    hand.rig.group.rotation.x = message.frame === "rig" ? Math.PI : 0;
     hand.rig.group.visible = message.joints.some((joint) => joint.position);
     this._paint(hand, message.joints.map(stateOf));
     hand.marks.place(hand.rig.bones);

@@ -51,15 +51,11 @@ export class ObjectMark {
   }
 
   /** Show a message of `object_json`; one without a place hides it. */
-  show({ position, orientation, frame }, colour, opacity) {
+  show({ position, orientation }, colour, opacity) {
     this.group.visible = Boolean(position && orientation);
     if (!this.group.visible) return;
     this.group.position.fromArray(position);
     this.group.quaternion.fromArray(orientation);
-    if (frame === "rig") {
-      this.group.position.set(position[0], -position[1], -position[2]);
-      this.group.quaternion.premultiply(new THREE.Quaternion(1, 0, 0, 0));
-    }
     this._box.material.color.set(colour);
     this._box.material.opacity = opacity;
   }

@@ -9,6 +9,7 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
+from common.geometry.tapered_capsules import Capsules
 from common.geometry.transforms import axis_rotation, quaternion_to_matrix, rigid
 from common.hand.wrist import STRAIGHT, forearm_palm
 from common.recording.frame_recording import Illumination
@@ -17,7 +18,7 @@ from common.sim.scenes import scene_by_name
 from common.sim.sensors import SimulatedImu
 from common.sim.together import TOGETHER
 from common.sim.wrist.capsules import THING_GROUP, bodies_of
-from common.sim.wrist.render import SURFACE_AT_M, Leds, WristRenderer
+from common.sim.wrist.render import SURFACE_AT_M, WristRenderer, led_levels
 from common.sim.wrist.scene import WristScene
 from common.sim.wrist.surface import HandSurface
 
@@ -51,6 +52,10 @@ class Doing:
         return replace(state, wrist_angles_rad=self.wrist_angles_rad, things=(held,))
 
 
+def bodies_at(shown: WristScene, t_s: float) -> Capsules:
+    return shown.bodies_of(shown.motion.at(t_s))
+
+
 def doing(wrist_angles_rad: Float = STRAIGHT, thing: Float | None = None) -> WristScene:
     return replace(SCENE, motion=Doing(SCENE.motion, wrist_angles_rad, thing))
 
@@ -75,7 +80,7 @@ def test_a_flexed_wrist_is_seen_as_a_device_that_is_mounted_so(t_s: float) -> No
 
 
 def test_the_forearm_stays_before_its_camera_when_the_wrist_bends() -> None:
-    flexed, straight = doing(WRIST_ANGLES).bodies_at(4.0), SCENE.bodies_at(4.0)
+    flexed, straight = bodies_at(doing(WRIST_ANGLES), 4.0), bodies_at(SCENE, 4.0)
     forearm = SCENE.capsules.forearm
     np.testing.assert_allclose(flexed.start_m[forearm], straight.start_m[forearm], atol=1e-12)
     moved = np.linalg.norm(flexed.stop_m - straight.stop_m, axis=1)
@@ -84,9 +89,11 @@ def test_the_forearm_stays_before_its_camera_when_the_wrist_bends() -> None:
 
 def test_a_palm_that_never_bends_is_prepared_once_and_one_that_hardly_bends_looks_alike() -> None:
     surface = HandSurface(SCENE, COARSE)
-    assert surface.palm(SCENE.bodies_at(7.0), np.zeros(2)) is surface.straight
+    assert surface.palm(bodies_at(SCENE, 7.0), np.zeros(2)) is surface.straight
     hardly = doing(np.array([1e-9, 0.0]))
-    assert surface.palm(hardly.bodies_at(7.0), hardly.motion.at(7.0).wrist_angles_rad) is not surface.straight
+    assert (
+        surface.palm(bodies_at(hardly, 7.0), hardly.motion.at(7.0).wrist_angles_rad) is not surface.straight
+    )
     one, other = (WristRenderer(s, "wrist", COARSE).render(7.0, LED).astype(int) for s in (SCENE, hardly))
     assert (one != other).mean() < 1e-3
 
@@ -94,7 +101,7 @@ def test_a_palm_that_never_bends_is_prepared_once_and_one_that_hardly_bends_look
 def test_a_palm_bent_out_of_the_picture_leaves_it_empty() -> None:
     away = doing(np.array([-1.6, 0.0]))
     assert not len(
-        HandSurface(away, COARSE).palm(away.bodies_at(7.0), away.motion.at(7.0).wrist_angles_rad).seen.pixel
+        HandSurface(away, COARSE).palm(bodies_at(away, 7.0), away.motion.at(7.0).wrist_angles_rad).seen.pixel
     )
     assert WristRenderer(away, "wrist", COARSE).render(7.0, LED).max() < 12
     assert np.isnan(away.truth(7.0).laser_uv).all()
@@ -116,7 +123,7 @@ def test_a_thing_takes_the_laser_from_the_fingers_and_hides_them() -> None:
     assert (with_it.laser_len_lit <= without.laser_len_lit + 1e-9).all()
     assert (with_it.laser_len_lit[2:6] == 0.0).sum() >= 3
     assert (with_it.tip_visible <= without.tip_visible).all()
-    bodies = shown.bodies_at(t_s)
+    bodies = bodies_at(shown, t_s)
     curve = shown.sheet.cross(bodies)
     on_it = curve.points[curve.group == THING_GROUP]
     assert len(on_it) > 100
@@ -129,7 +136,7 @@ def test_a_thing_takes_the_laser_from_the_fingers_and_hides_them() -> None:
 
 def test_a_dark_thing_gives_little_light_back() -> None:
     shown, t_s = doing(thing=ACROSS), 16.0
-    curve = shown.sheet.cross(shown.bodies_at(t_s))
+    curve = shown.sheet.cross(bodies_at(shown, t_s))
     middle = curve.points[(curve.group == THING_GROUP) & curve.seen]
     u, v = np.round(shown.optics.project(middle[len(middle) // 2])).astype(int)
     around = np.s_[v - 3 : v + 4, u - 3 : u + 4]
@@ -143,17 +150,17 @@ def test_a_dark_thing_gives_little_light_back() -> None:
 def test_behind_a_thing_the_leds_do_not_shine() -> None:
     across = rigid(axis_rotation(0, np.pi / 2), np.array([0.0, 0.0, 0.5 * SURFACE_AT_M]))
     bar = bodies_of([Cylinder(across, 0.004, 0.06, False)], np.eye(4))
-    leds = Leds(np.array([[0.01, 0.0, 0.0], [-0.01, 0.0, 0.0]]))
+    leds = np.array([[0.01, 0.0, 0.0], [-0.01, 0.0, 0.0]])
     # The shadow of the bar's axis by each LED, the middle between them, and far outside.
     points = np.array([[x, 0.0, SURFACE_AT_M] for x in (-0.01, 0.01, 0.0, 0.05)], dtype=np.float32)
     normals = np.tile(np.array([0.0, 0.0, -1.0], dtype=np.float32), (4, 1))
-    whole, shaded = leds.on_surface(points, normals), leds.on_surface(points, normals, bar)
+    whole, shaded = led_levels(leds, points, normals), led_levels(leds, points, normals, bar)
     assert 0.3 < shaded[0] / whole[0] < 0.7
     assert shaded[0] == pytest.approx(shaded[1], rel=1e-5)
     np.testing.assert_array_equal(shaded[2:], whole[2:])
     on_bar = np.array([[0.0, 0.0, 0.5 * SURFACE_AT_M - 0.004]], dtype=np.float32)
     np.testing.assert_array_equal(
-        leds.on_surface(on_bar, normals[:1], bar), leds.on_surface(on_bar, normals[:1])
+        led_levels(leds, on_bar, normals[:1], bar), led_levels(leds, on_bar, normals[:1])
     )
 
 

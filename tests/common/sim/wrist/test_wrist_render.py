@@ -12,7 +12,7 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration, l
 from common.errors import CalibrationError
 from common.recording.frame_recording import Illumination
 from common.sim.scenes import renderer_of
-from common.sim.wrist.render import SURFACE_AT_M, Leds, Sensor, WristRenderer
+from common.sim.wrist.render import SURFACE_AT_M, Sensor, WristRenderer, led_levels
 from common.sim.wrist.scene import WristScene
 
 CALIB = Path(__file__).resolve().parents[4] / "calib_json"
@@ -44,7 +44,7 @@ def test_the_line_is_drawn_where_the_truth_says_to_parts_of_a_pixel(t_s: float) 
     shown = scene("curl@dark")
     dim = WristRenderer(shown, "wrist").exposed(60.0, np.full(3, 0.03))  # so that it does not saturate
     image = dim.render(t_s, LASER)
-    bodies = shown.capsules.bodies(shown.joints_at(t_s))
+    bodies = shown.capsules.bodies(shown.truth(t_s).joints)
     curve = shown.sheet.cross(bodies)
     uv = shown.optics.project(curve.points)
     off: list[float] = []
@@ -102,15 +102,15 @@ def test_a_window_saturates_in_every_room_that_has_one(ambient: str, least: floa
 
 
 def test_leds_light_by_the_inverse_square_and_the_cosine() -> None:
-    leds = Leds(np.array([[0.0, 0.0, 0.0]] * 4))
+    leds = np.array([[0.0, 0.0, 0.0]] * 4)
     points = np.array(
         [[0.0, 0.0, SURFACE_AT_M], [0.0, 0.0, 2 * SURFACE_AT_M], [0.0, 0.0, SURFACE_AT_M]], dtype=np.float32
     )
     normals = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [np.sqrt(0.75), 0.0, -0.5]], dtype=np.float32)
-    near, far, aslant = leds.on_surface(points, normals).tolist()
+    near, far, aslant = led_levels(leds, points, normals).tolist()
     assert near == pytest.approx(4.0 * far, rel=1e-5)
     assert near == pytest.approx(2.0 * aslant, rel=1e-5)
-    behind = leds.on_surface(points[:1], -normals[:1])
+    behind = led_levels(leds, points[:1], -normals[:1])
     assert behind[0] == 0.0
 
 

@@ -144,7 +144,7 @@ def test_the_line_on_a_ball_is_the_arc_of_its_slice_that_faces_the_laser() -> No
 def test_the_line_is_on_the_plane_on_the_surface_and_in_no_shadow(side: str, t_s: float) -> None:
     shown = scene("standard", side=side)
     sheet = shown.sheet
-    bodies = shown.capsules.bodies(shown.joints_at(t_s))
+    bodies = shown.capsules.bodies(shown.truth(t_s).joints)
     curve = sheet.cross(bodies)
     some = slice(None, None, 61)
     points = curve.points[some]
@@ -197,8 +197,8 @@ def test_the_joint_of_the_thumb_parts_it_from_its_ball() -> None:
     shown = scene("poses")
     both = 0
     for t_s in np.arange(1.2, 60.0, 2.5).tolist():
-        joints = shown.joints_at(t_s).position_m
-        curve = shown.sheet.cross(shown.capsules.bodies(shown.joints_at(t_s)))
+        joints = shown.truth(t_s).joints.position_m
+        curve = shown.sheet.cross(shown.capsules.bodies(shown.truth(t_s).joints))
         ball, beyond = (curve.points[curve.group == group] for group in (THENAR_GROUP, THUMB_GROUP))
         before, after = (joints[k + 1] - joints[k] for k in (2, 3))
         halving = before / np.linalg.norm(before) + after / np.linalg.norm(after)

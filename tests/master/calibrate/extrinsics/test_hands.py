@@ -7,7 +7,7 @@ import numpy as np
 from common.arrays import Float
 from common.geometry.transforms import rotation_vector_to_matrix
 from master.calibrate.adjust import Normal
-from master.calibrate.extrinsics.normal import HandProblem, Hands
+from master.calibrate.extrinsics.problem import HandProblem, Hands
 from master.estimator.kinematics import BodyPoints
 from master.estimator.parameters import HandParameters
 from master.estimator.priors import PosturePrior, posture_prior_of

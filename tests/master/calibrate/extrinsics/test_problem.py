@@ -9,8 +9,7 @@ from common.arrays import Float
 from common.geometry.transforms import quaternion_to_matrix, rotation_vector_to_matrix
 from common.hand.wrist import forearm_palm
 from master.calibrate.extrinsics.extrinsics import _cycles
-from master.calibrate.extrinsics.normal import Hands
-from master.calibrate.extrinsics.problem import Problem, bends_by_rotation, wrist_rotation_angles
+from master.calibrate.extrinsics.problem import Hands, Problem, bends_by_rotation, wrist_rotation_angles
 from master.calibrate.extrinsics.tracks import HandTrack, ImuTrack, LinesOfSight
 from master.calibrate.extrinsics.unknown import UNKNOWN, Unknown, prior_sigma
 from master.rig.wrist import WristSetup

@@ -10,7 +10,6 @@ import numpy.typing as npt
 import pytest
 from msgspec.structs import replace
 
-from common.bus.bus import LoopbackBus
 from common.calibration import RigCalibration, load, save
 from common.calibration.object_profile import ObjectProfile
 from common.clock import Clock
@@ -21,8 +20,9 @@ from master.__main__ import main
 from master.calibrate.tracker.command import guide, read_motion, write_motion
 from master.calibrate.tracker.tracks import coverage_of, object_track, tracker_track
 from master.objects.tracker import TrackerLine
-from master.outputs.bus import DevicePoses
+from master.outputs.bus import publishing_devices
 from tests.master.calibrate.tracker.simulated import ZERO_NS, Motion
+from tests.memory_bus import LoopbackBus
 
 CALIB = Path(__file__).resolve().parents[4] / "calib_json"
 SECOND = 1_000_000_000
@@ -249,8 +249,8 @@ def test_what_a_tracker_says_goes_on_the_bus_as_it_came() -> None:
 
     bus = LoopbackBus()
     received = bus.subscribe("device", "tracker")
-    passing = DevicePoses(Source().get, bus)
-    taken = [passing.get(0.0) for _ in range(5)]
+    passing = publishing_devices(Source().get, bus)
+    taken = [passing(0.0) for _ in range(5)]
     assert taken[3:] == ["a frame", None]
     for was in taken[:3]:
         came = received.get(0.1)

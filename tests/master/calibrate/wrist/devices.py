@@ -11,7 +11,8 @@ from common.calibration.rig import LaserPlane
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import rotation_vector_to_matrix
 from common.recording.frame_recording import Illumination
-from common.sim.wrist.board import ILLUMINATIONS, WristBoardRenderer, WristBoardScene, board_poses
+from common.sim.wrist.board import WristBoardRenderer, WristBoardScene, board_poses
+from common.sim.wrist.record import ORDER
 from master.calibrate.cameras.boards import Checkerboard
 from master.calibrate.wrist.device import LitView
 from tests.conftest import ROOT
@@ -46,7 +47,7 @@ def scene_of(seed: int, views: int, *, anywhere: bool = False) -> WristBoardScen
 def cycles_of(seed: int, views: int) -> tuple[dict[Illumination, Image], ...]:
     """The rendered triples of such a scene."""
     renderer = WristBoardRenderer(scene_of(seed, views))
-    return tuple({lit: renderer.render(pose, lit) for lit in ILLUMINATIONS} for pose in range(views))
+    return tuple({lit: renderer.render(pose, lit) for lit in ORDER} for pose in range(views))
 
 
 def view_of(name: str, frames: dict[Illumination, Image]) -> LitView:

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from common.bus.bus import LoopbackBus
 from common.calibration import load, save
 from common.calibration.output_settings import OscOutput, OutputSettings, VmcOutput, default_outputs
 from common.errors import BusError, CalibrationError, PhalanxError
@@ -20,6 +19,7 @@ from master.outputs.network.conventions import MasterTimes
 from master.outputs.network.outputs import DEPTH, OUTPUTS, Counters, Output, OutputLine
 from master.outputs.network.sender import NAME, Housekeeping, Sender, run_sender, settings_of
 from tests.master.outputs.network.hands import hand_pose
+from tests.memory_bus import LoopbackBus
 
 FILE = Path(__file__).parents[4] / "calib_json" / "outputs" / "default.json"
 OSC_ON = replace(default_outputs(), osc=OscOutput(on=True, port=9001))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from common.hand.model import FINGERS, JOINTS
 from common.messages import Contact, Gesture, HandPose, ObjectPose
 from master.outputs.poses import Poses, PosesFile, RunFiles
-from master.outputs.result_files import ObjectPoses, load_contact
+from master.outputs.result_files import Contacts, ObjectPoses
 from master.recording.export.run import Wanted, export
 from master.recording.export.table import (
     Column,
@@ -144,8 +144,8 @@ def all_columns(tmp_path: Path) -> list[list[Column]]:
     assert isinstance(pinch, Gesture)
     return [
         hand_columns(Poses.of(poses_of(1, 1)), BEGIN_NS),
-        object_columns(ObjectPoses.of("cup", [cup]), BEGIN_NS),
-        contact_columns(load_contact(source.parent / "contact_made-right_cup.npz"), BEGIN_NS),
+        object_columns(ObjectPoses.stacked([cup], object="cup"), BEGIN_NS),
+        contact_columns(Contacts.load(source.parent / "contact_made-right_cup.npz"), BEGIN_NS),
         gesture_columns([pinch], BEGIN_NS),
     ]
 
