@@ -2,9 +2,9 @@
 
 A calibration minimises a sum of squared residuals, outliers weighed down by a robust loss, over S shared
 unknowns (lenses, bones, a mounting) and L own unknowns of each of T epochs (the pose of a board, a hand). An
-epoch touches only its own unknowns and those of a few epochs behind it, so these are eliminated by a sparse
-factorisation, and the Schur complement that is left is the information about the shared ones (Triggs et al.,
-Bundle adjustment - a modern synthesis, 2000, section 6). Steps are those of Levenberg and Marquardt.
+epoch touches only its own unknowns, so these are eliminated by a sparse factorisation, and the Schur complement
+that is left is the information about the shared ones (Triggs et al., Bundle adjustment - a modern synthesis,
+2000, section 6). Steps are those of Levenberg and Marquardt.
 
 A calibration is a function `equations(x) -> Normal`, which adds its rows and priors, and a function
 `stepped(x, shared, own) -> x`, which applies a step to its own kind of unknowns (rotations turn, numbers add).
@@ -28,17 +28,6 @@ Loss = Callable[[Float], tuple[Float, Float]]
 def cauchy(sigmas: float) -> Loss:
     """Cauchy's loss: at that many standard deviations a residual counts a half."""
     return lambda chi2: (sigmas**2 * np.log1p(chi2 / sigmas**2), 1.0 / (1.0 + chi2 / sigmas**2))
-
-
-def huber(sigmas: float) -> Loss:
-    """Huber's loss: beyond that many sigmas a residual costs by its size."""
-
-    def loss(chi2: Float) -> tuple[Float, Float]:
-        size = np.sqrt(np.maximum(chi2, 1e-24))
-        beyond = size > sigmas
-        return np.where(beyond, 2.0 * sigmas * size - sigmas**2, chi2), np.where(beyond, sigmas / size, 1.0)
-
-    return loss
 
 
 def geman_mcclure(sigmas: float) -> Loss:
@@ -78,16 +67,14 @@ class Normal:
     Attributes:
         cost: Sum of the losses; without a robust loss, chi square.
         shared, gradient: (S, S) information and (S,) half the gradient of the cost.
-        own: (T, B, L, L) blocks of the information: [t, d] couples the unknowns of epoch t + d (rows) with
-            those of epoch t (columns).
-        mixed, own_gradient: (T, L, S) and (T, L).
+        own, mixed, own_gradient: (T, L, L), (T, L, S) and (T, L) of the own unknowns.
     """
 
-    def __init__(self, shared: int, epochs: int = 0, own: int = 0, bands: int = 1) -> None:
+    def __init__(self, shared: int, epochs: int = 0, own: int = 0) -> None:
         self.cost = 0.0
         self.shared: Float = np.zeros((shared, shared))
         self.gradient: Float = np.zeros(shared)
-        self.own: Float = np.zeros((epochs, bands, own, own))
+        self.own: Float = np.zeros((epochs, own, own))
         self.mixed: Float = np.zeros((epochs, own, shared))
         self.own_gradient: Float = np.zeros((epochs, own))
 
@@ -124,7 +111,7 @@ class Normal:
         self.gradient[columns] += flat.T @ residual.ravel()
         if own is not None:
             back = np.swapaxes(np.where(root > 0.0, own * root, 0.0), 1, 2)
-            self.own[epochs, 0] += back @ np.swapaxes(back, 1, 2)
+            self.own[epochs] += back @ np.swapaxes(back, 1, 2)
             self.own_gradient[epochs] += (back @ residual[..., None])[..., 0]
             cross = back @ heavy
             if isinstance(columns, slice):
@@ -137,10 +124,8 @@ class Normal:
     def hold(self, held: Bool) -> None:
         """Keep own unknowns (T, L) in the next step, as an angle at its limit."""
         moves = np.where(held, 0.0, 1.0)
-        for d in range(min(self.own.shape[1], len(moves))):
-            count = len(moves) - d
-            self.own[:count, d] *= moves[d:, :, None] * moves[:count, None, :]
-        np.einsum("tii->ti", self.own[:, 0])[...] += held
+        self.own *= moves[:, :, None] * moves[:, None, :]
+        np.einsum("tii->ti", self.own)[...] += held
         self.mixed *= moves[..., None]
         self.own_gradient *= moves
 
@@ -161,7 +146,7 @@ class Normal:
         Raises:
             RuntimeError: The own unknowns' equations cannot be solved.
         """
-        size, (count, _, length, _) = len(self.gradient), self.own.shape
+        size, (count, length) = len(self.gradient), self.own_gradient.shape
         information = self.shared + damping * np.diag(np.diag(self.shared))
         if not count:
             return information, self.gradient, self.mixed, self.own_gradient
@@ -180,26 +165,11 @@ class Normal:
 
     def _matrix(self, damping: float) -> csc_array:
         """The own unknowns' information (T L, T L), damped."""
-        count, bands, length, _ = self.own.shape
+        count, length = self.own_gradient.shape
         nothing = 1e-9  # information of what nothing constrains
-        blocks, rows, columns = list[Float](), list[Int](), list[Int]()
-        for d in range(min(bands, count)):
-            block: Float = self.own[: count - d, d]
-            first = np.arange(count - d, dtype=np.int64)
-            if d == 0:
-                block = block + np.eye(length) * (damping * block + nothing)
-            blocks.append(block)
-            rows.append(first + d)
-            columns.append(first)
-            if d:
-                blocks.append(np.swapaxes(block, 1, 2))
-                rows.append(first)
-                columns.append(first + d)
-        row, column = np.concatenate(rows), np.concatenate(columns)
-        order = np.lexsort((column, row))
-        starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=count))])
-        data, shape = np.concatenate(blocks)[order], (count * length, count * length)
-        return csc_array(bsr_array((data, column[order], starts), shape=shape))
+        blocks = self.own + np.eye(length) * (damping * self.own + nothing)
+        shape, at = (count * length, count * length), np.arange(count + 1, dtype=np.int64)
+        return csc_array(bsr_array((blocks, at[:-1], at), shape=shape))
 
     def step(self, damping: float) -> tuple[Float, Float] | None:
         """Marquardt's step of shared (S,) and own unknowns (T, L); None: more damping."""
@@ -215,7 +185,7 @@ class Normal:
 
     def predicted_gain(self, shared: Float, own: Float, damping: float) -> float:
         """By how much a step of this damping would lower the cost if all were linear."""
-        on = np.einsum("tii->ti", self.own[:, 0]) if own.size else own
+        on = np.einsum("tii->ti", self.own)
         squares = np.diag(self.shared) @ shared**2 + float((on * own**2).sum())
         return float(damping * squares - self.gradient @ shared - (self.own_gradient * own).sum())
 
@@ -238,7 +208,7 @@ class Normal:
 
 
 def _unit_scale(information: Float) -> Float:
-    return 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    return 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-30))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -178,6 +178,8 @@ def _equations(
     loss = None if cauchy_px is None else cauchy(cauchy_px)
     for seen in observations:
         off, by_lens, by_camera, by_view, by_shape = _jacobian(seen, bundle)
+        if not np.isfinite(off).all():
+            normal.cost = np.inf  # a board went through a camera: no such step
         c, rows = seen.camera, off.size
         at = np.r_[9 * c : 9 * c + 9, 9 * cameras + 6 * c : 9 * cameras + 6 * c + 6]
         by = np.concatenate([by_lens, by_camera], axis=2).reshape(rows, -1)

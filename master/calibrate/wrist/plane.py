@@ -15,6 +15,7 @@ known to a tenth of a degree and of a millimetre is refused.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 
 import cv2
@@ -26,6 +27,7 @@ from common.calibration.rig import LaserPlane
 from common.errors import FitError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import cross, transform
+from master.calibrate.adjust import Normal, minimise
 from master.calibrate.cameras.boards import Board, grid_shape
 from master.calibrate.wrist.device import BoardPose
 
@@ -346,37 +348,37 @@ def _reduced(views: Sequence[ViewLine], used: Bool, normal: Float, offset: float
 
 
 def _least_squares(views: Sequence[ViewLine], normal: Float) -> tuple[Float, float, Float]:
-    """Normal, offset, covariance (4, 4), by Gauss-Newton on rotation and offset."""
+    """Normal, offset, covariance (4, 4), from a first normal."""
     middle = np.concatenate([view.ends_m for view in views]).mean(axis=0)
-    level = float(normal @ middle)
-    tangents, cov3 = np.eye(3)[:, :2], np.eye(3)
-    for _ in range(6):
-        tangents = np.linalg.svd(normal[None])[2][1:].T
-        information, pull = np.zeros((3, 3)), np.zeros(3)
-        for view in views:
-            arm = view.ends_m - middle
-            off = arm @ normal - (level - normal @ middle)
-            # By turn of the normal and shift of the plane; about the middle the two hardly depend on each other.
-            jacobian = np.concatenate([arm @ tangents, -np.ones((2, 1))], axis=1)
-            weight = np.linalg.inv(view.covariance(normal))
-            information += jacobian.T @ weight @ jacobian
-            pull -= jacobian.T @ weight @ off
-        scale = 1.0 / np.sqrt(np.diag(information))
-        values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-        if values[0] < 1e-9:
-            raise FitError(_collinear(0.0))
-        cov3 = (vectors / values) @ vectors.T * np.outer(scale, scale)
-        step = cov3 @ pull
-        shift = level - normal @ middle + step[2]
-        normal = normal + tangents @ step[:2]
-        normal = normal / np.linalg.norm(normal)
-        level = float(normal @ middle) + shift
+    # By turn of the normal and distance from the middle, which hardly depend on each other.
+    found = minimise(partial(_equations, views, middle), _stepped, np.append(normal, 0.0), steps=20)
+    normal, tangents = found.x[:3], _tangents(found.x[:3])
+    offset = float(normal @ middle + found.x[3])
     to4 = np.zeros((4, 3))
     to4[:3, :2] = tangents
     to4[3] = np.append(middle @ tangents, 1.0)
-    if level < 0.0:
-        return -normal, -level, to4 @ cov3 @ to4.T
-    return normal, level, to4 @ cov3 @ to4.T
+    sign = -1.0 if offset < 0.0 else 1.0
+    return sign * normal, sign * offset, to4 @ found.normal.covariance() @ to4.T
+
+
+def _equations(views: Sequence[ViewLine], middle: Float, plane: Float) -> Normal:
+    """Normal equations of a plane (normal, distance from the middle) by two turns and a shift."""
+    out, normal, tangents = Normal(3), plane[:3], _tangents(plane[:3])
+    for view in views:
+        whiten, arm = np.linalg.inv(np.linalg.cholesky(view.covariance(normal))), view.ends_m - middle
+        by = np.concatenate([arm @ tangents, -np.ones((2, 1))], axis=1)
+        out.add((whiten @ (arm @ normal - plane[3]))[None], (whiten @ by)[None])
+    return out
+
+
+def _stepped(plane: Float, step: Float, _own: Float) -> Float:
+    normal = plane[:3] + _tangents(plane[:3]) @ step[:2]
+    return np.append(normal / np.linalg.norm(normal), plane[3] + step[2])
+
+
+def _tangents(normal: Float) -> Float:
+    """Two directions (3, 2) in a plane."""
+    return np.linalg.svd(normal[None])[2][1:].T
 
 
 def _refuse_unsure(fit: PlaneFit, points: Float) -> None:
