@@ -94,21 +94,22 @@ def board(command: ArgumentParser) -> None:
 
     Examples:
       phalanx calibrate board -o board.pdf
-      phalanx calibrate board --kind charuco --paper A3 --board 11x7 --square-mm 36 -o board.pdf
+      phalanx calibrate board --paper A3 --board 11x7 --square-mm 36 -o board.pdf
+      phalanx calibrate board --kind checkerboard -o board.pdf
     """
     command.add_argument(
         "--out", "-o", type=Path, required=True, metavar="FILE", help="file to write, .pdf or .svg"
     )
-    add_choice(command, "--kind", ("checkerboard", "charuco"), "kind of board", default="checkerboard")
+    add_choice(command, "--kind", ("charuco", "checkerboard"), "kind of board", default="charuco")
     add_text(command, "--paper", "PAPER", "a4, A3, A2 or letter", default="A4")
     add_text(
         command,
         "--board",
         "SIZE",
-        "COLUMNSxROWS: inner corners, of a ChArUco board squares. Default: 9x6, 9x6",
+        "COLUMNSxROWS: squares, of a checkerboard its inner corners. Default: 9x6",
         dest="size",
     )
-    add_number(command, "--square-mm", "MM", "side of a square. Default: 25, 29")
+    add_number(command, "--square-mm", "MM", "side of a square. Default: 29, of a checkerboard 25")
     add_number(command, "--marker-mm", "MM", "side of a marker. Default: 3/4 square")
     add_dictionary(command)
 

@@ -13,7 +13,8 @@ markers begin.
 
 import re
 from argparse import Namespace
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import cast
 
 import cv2
@@ -48,13 +49,18 @@ class Checkerboard:
 
 @dataclass(frozen=True, slots=True)
 class Charuco:
-    """ChArUco board: markers identify its corners; first square dark (OpenCV's way)."""
+    """ChArUco board: markers identify its corners.
+
+    Its first square is dark; in the `old_layout`, that of OpenCV before 4.6, it is light where rows are even.
+    """
 
     columns: int  # this and rows: squares along x and y, at least 3
     rows: int
     square_m: float  # this and marker_m: side of a square and of a marker [m]
     marker_m: float
     dictionary: str = "4X4_50"  # name of the marker family without `DICT_`, such as 4X4_50
+    old_layout: bool = False
+    inverted: bool = False  # printed white on black
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3:
@@ -75,6 +81,7 @@ class Charuco:
         return (
             f"ChArUco board of {self.columns} x {self.rows} squares of {self.square_m * 1e3:g} mm,"
             f" markers of {self.marker_m * 1e3:g} mm from {self.dictionary}"
+            f"{', in the layout of OpenCV before 4.6' * self.old_layout}{', white on black' * self.inverted}"
         )
 
     def markers(self) -> cv2.aruco.Dictionary:
@@ -83,7 +90,16 @@ class Charuco:
 
     def pattern(self) -> cv2.aruco.CharucoBoard:
         """The board as OpenCV knows it."""
-        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_m, self.marker_m, self.markers())
+        size = self.columns, self.rows
+        board = cv2.aruco.CharucoBoard(size, self.square_m, self.marker_m, self.markers())
+        board.setLegacyPattern(self.old_layout)
+        return board
+
+    def layouts(self) -> Iterator["Charuco"]:
+        """This board as other programs print it: in the old layout, white on black, both."""
+        for old, inverted in ((True, False), (False, True), (True, True)):
+            if not old or self.rows % 2 == 0:
+                yield replace(self, old_layout=old, inverted=inverted)
 
 
 Board = Checkerboard | Charuco
@@ -233,7 +249,8 @@ def _upright(board: Checkerboard, grey: Image, corners: Float) -> Float:
 
 
 def _charuco(board: Charuco, grey: Image) -> Float | None:
-    detected = cv2.aruco.CharucoDetector(board.pattern()).detectBoard(grey)
+    image = cv2.bitwise_not(grey) if board.inverted else grey
+    detected = cv2.aruco.CharucoDetector(board.pattern()).detectBoard(image)
     # The stubs promise arrays; where nothing is seen there is None.
     found, ids = cast(tuple[Float | None, Int | None], detected[:2])
     if found is None or ids is None:

@@ -265,6 +265,8 @@ def _views(options: Namespace) -> BoardViews:
             echo(f"looking for the {board}: {done} of {images} images", error=True)
 
     views = look(board, sets, progress)
+    if views.board != board:
+        echo(f"the pictures show a {views.board}")
     if views.unseen:
         echo(f"no board in {len(views.unseen)} of {images} images: {', '.join(views.unseen)}")
     return views

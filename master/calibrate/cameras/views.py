@@ -4,7 +4,7 @@ Sources: a folder of files, a folder per camera, or a recording of ours.
 """
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -52,10 +52,11 @@ class BoardViews:
 
 
 def look(
-    board: Board, sets: Iterable[tuple[str, ImageSet]], progress: Callable[[str], None] = lambda _: None
+    board: Board, sets: Sequence[tuple[str, ImageSet]], progress: Callable[[str], None] = lambda _: None
 ) -> BoardViews:
     """Find the board in all images of `sets`: name of each view and its images.
 
+    A ChArUco board of another layout, or white on black, is recognised: `BoardViews.board` is then that.
     `progress` is called after each image with "view camera".
 
     Raises:
@@ -66,6 +67,7 @@ def look(
     views: list[View] = []
     unseen: list[str] = []
     first: list[Image] = []
+    board = _as_printed(board, sets)
     for name, images in sets:
         observations: dict[str, ImageObservation] = {}
         for camera, load in images.items():
@@ -90,6 +92,21 @@ def look(
     if not views:
         raise FitError(f"no {board} in any of {len(unseen)} images: {_advice(board, first)}")
     return BoardViews(board, sizes, tuple(views), tuple(unseen))
+
+
+def _as_printed(board: Board, sets: Sequence[tuple[str, ImageSet]]) -> Board:
+    """The layout of a ChArUco board that some images show; as given where none of them shows it."""
+    if not isinstance(board, Charuco):
+        return board
+    loads = [load for _, images in sets for load in images.values()]
+    tried = 12  # images, spread over all
+    images: list[Image] = []
+    for i in np.unique(np.linspace(0, max(len(loads) - 1, 0), min(tried, len(loads))).astype(np.int64)):
+        images.append(loads[int(i)]())
+        if find_board(board, images[-1]) is not None:
+            return board
+    found = (other for other in board.layouts() if any(find_board(other, image) for image in images))
+    return next(found, board)
 
 
 def _advice(board: Board, images: list[Image]) -> str:

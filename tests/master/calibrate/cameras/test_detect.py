@@ -1,5 +1,7 @@
 """Corners found in rendered images, against truth in pixels; boards found, told apart and advised about."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -78,6 +80,25 @@ def test_the_board_that_is_there_is_named_when_another_was_asked_for() -> None:
         _look(Charuco(7, 5, 0.035, 0.026, "6X6_250"), charuco)
     with pytest.raises(FitError, match="there is no image"):
         look(CHECKER, [])
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+@pytest.mark.parametrize("old_layout", [False, True])
+def test_a_charuco_board_is_taken_as_it_is_printed(old_layout: bool, inverted: bool) -> None:
+    asked, printed = Charuco(7, 6, 0.035, 0.026), Charuco(7, 6, 0.035, 0.026, old_layout=old_layout)
+    truth = scene(27, 1, views=2, board=printed)
+    images = [render(truth, view, "left", seed=27) for view in range(2)]
+    if inverted:
+        images = [255 - image for image in images]
+    views = look(asked, [(str(i), {"left": lambda image=image: image}) for i, image in enumerate(images)])
+    assert views.board == replace(printed, inverted=inverted)
+    assert ("OpenCV before 4.6" in str(views.board), "white on black" in str(views.board)) == (
+        old_layout,
+        inverted,
+    )
+    assert not views.unseen
+    for view, (_, seen) in enumerate(views.of("left")):
+        assert np.sqrt(np.nanmean((seen.corners_px - truth.corners(view, "left")) ** 2)) < 0.3
 
 
 def test_images_of_two_modes_are_refused() -> None:
