@@ -3,7 +3,8 @@
 Corner i of an image is seen at pixel = lens(T_camera_rig T_rig_board (c_i + s_i)), where c_i is the drawn
 corner and s_i its offset on the real, never quite flat board. The board's pose is a view's own unknown
 (`master.calibrate.adjust`), all else is shared. A prior of the shape about the drawn one also fixes the
-board's frame and size: few views leave it as drawn.
+board's frame and size: few views leave it as drawn. Lenses have a weak prior: what corners in a small part of
+the image hardly determine stays near that of an ordinary lens, and its standard deviation says so.
 """
 
 from collections.abc import Sequence
@@ -34,6 +35,7 @@ class Bundle:
     """What is estimated."""
 
     lenses: Float  # (C, 9) in the order `LENS`
+    centre_px: Float  # (C, 2) middle of the images
     T_camera_rig: Float  # (C, 4, 4) [m]
     T_rig_board: Float  # (V, 4, 4) [m]
     # this and shape_m: (N, 3) [m] corners of the board as drawn, and the offsets of the real ones
@@ -94,7 +96,7 @@ def solve(
     """Minimise the sum of squared residuals, or of Cauchy losses per corner.
 
     Every view of `start` is in an observation. With `cauchy_px` a corner begins to lose its weight at that
-    residual. `sigma_px` is a corner's standard deviation, against which the prior of the shape is weighed.
+    residual. `sigma_px` is a corner's standard deviation, against which the priors are weighed; 0: none.
     What the observations do not determine has an enormous standard deviation in the result.
     """
     mask = free.mask(len(start.drawn_m))
@@ -102,7 +104,14 @@ def solve(
     prior_px_m = sigma_px / shape_sd_m if free.shape else 0.0
 
     def equations(bundle: Bundle) -> Normal:
-        return _equations(observations, bundle, mask, prior_px_m, cauchy_px)
+        normal = _equations(observations, bundle, mask, prior_px_m, cauchy_px)
+        if sigma_px == 0.0:
+            return normal
+        away, sd = lens_prior(bundle)
+        other = np.full(len(mask) - away.size, np.inf)
+        sigma = np.r_[sd.ravel() / sigma_px, other]
+        normal.add_prior(np.r_[away.ravel(), np.zeros(other.size)][mask], sigma[mask])
+        return normal
 
     def stepped(bundle: Bundle, step: Float, own: Float) -> Bundle:
         shared = np.zeros(len(mask))
@@ -112,6 +121,20 @@ def solve(
     # robust fits only judge
     found = minimise(equations, stepped, start, gain_share=1e-8 if cauchy_px is None else 1e-6)
     return _solution(observations, found, mask, free)
+
+
+def lens_prior(bundle: Bundle) -> tuple[Float, Float]:
+    """How far lenses (C, 9) are from ordinary ones, and the standard deviations (C, 9) of these; inf: none.
+
+    The principal point lies in the middle of the image, to a twentieth of its width; no distortion, to what
+    lenses of 50 to 90 degrees have.
+    """
+    away = bundle.lenses.copy()
+    away[:, :2], away[:, 2:4] = 0.0, bundle.lenses[:, 2:4] - bundle.centre_px
+    sd = np.empty_like(away)
+    sd[:] = [np.inf, np.inf, 0.0, 0.0, 0.3, 0.3, 0.005, 0.005, 0.3]
+    sd[:, 2:4] = 0.1 * bundle.centre_px[:, :1]
+    return away, sd
 
 
 def predict(bundle: Bundle, seen: Observation) -> Float:

@@ -23,6 +23,7 @@ from master.calibrate.cameras.outliers import (
     Rejection,
     Seen,
     Shot,
+    centre_of,
     fit_alone,
     judge,
     place_boards,
@@ -124,7 +125,8 @@ def _islands(cameras: Sequence[str], places: Places) -> str:
 
 _ROUNDS = 6
 _TANGENTIAL = (6, 7)
-_TERMS = ((8,), _TANGENTIAL, (5,), (4,))  # k3, p1 and p2, k2, k1: in this order they are given up
+_RADIAL = ((5,), (4,))
+_TERMS = ((8,), _TANGENTIAL, *_RADIAL)  # k3, p1 and p2, k2, k1: in this order they are given up
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,6 +176,7 @@ def fit_cameras(
     drawn = board_corners(views.board)
     start = Bundle(
         lenses=np.stack([alone[camera].lens for camera in views.cameras]),
+        centre_px=np.array([centre_of(views.sizes_px[camera]) for camera in views.cameras]),
         T_camera_rig=np.stack([links.T_camera_rig[camera] for camera in views.cameras]),
         T_rig_board=np.zeros((0, 4, 4)),
         drawn_m=drawn,
@@ -285,7 +288,8 @@ def _determined(solution: Solution, lenses: Bool) -> Bool:
             covariance = solution.covariance[np.ix_(at, at)]
             square = float(lens[index] @ cast(Float, np.linalg.solve(covariance, lens[index])))
             sure = 3.0  # standard deviations that a term of the distortion must be away from zero
-            if square < len(index) * sure**2:
+            known = 0.1  # of k1, k2: corners that cover little leave them with their prior, as unsure as that
+            if square < len(index) * sure**2 and (term not in _RADIAL or covariance[0, 0] < known**2):
                 kept[camera, index] = False
                 break
             if term != _TANGENTIAL and not kept[camera, _TANGENTIAL[0]]:

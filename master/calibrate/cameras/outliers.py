@@ -78,6 +78,11 @@ class Alone:
     sigma_px: float  # robust standard deviation of a coordinate
 
 
+def centre_of(size_px: tuple[int, int]) -> Float:
+    """The middle (2,) [px] of an image."""
+    return (np.array(size_px, np.float64) - 1.0) / 2.0
+
+
 def corners_seen(observation: ImageObservation) -> tuple[Int, Float]:
     """Numbers (n,) and places (n, 2) [px] of the corners seen."""
     seen = np.flatnonzero(np.isfinite(observation.corners_px[:, 0])).astype(np.int64)
@@ -111,7 +116,7 @@ def fit_alone(views: BoardViews, camera: str, held: Float | None = None) -> Alon
     dof = np.array([2.0 * len(uv) - 6.0 for _, uv in seen])
     for round_ in range(_ROUNDS):
         if held is None:
-            lens, sigma = _robust(good, seen, drawn, lens, first=round_ == 0)
+            lens, sigma = _robust(good, seen, drawn, lens, views.sizes_px[camera], first=round_ == 0)
         placed = [place_board(drawn[corners], uv, lens) for corners, uv in seen]
         errors = np.array([error for _, error in placed])
         bound = limit(errors, dof)
@@ -137,12 +142,20 @@ def fit_alone(views: BoardViews, camera: str, held: Float | None = None) -> Alon
 
 
 def _robust(
-    good: list[int], seen: list[tuple[Int, Float]], drawn: Float, lens: Float, *, first: bool
+    good: list[int],
+    seen: list[tuple[Int, Float]],
+    drawn: Float,
+    lens: Float,
+    size_px: tuple[int, int],
+    *,
+    first: bool,
 ) -> tuple[Float, float]:
     """Fit a lens with Cauchy's loss at three robust deviations of the residuals."""
     observations = [Observation(0, view, *seen[i]) for view, i in enumerate(good)]
     places = np.stack([place_board(drawn[seen[i][0]], seen[i][1], lens)[0] for i in good])
-    bundle = Bundle(lens[None], np.eye(4)[None], places, drawn, np.zeros_like(drawn))
+    bundle = Bundle(
+        lens[None], centre_of(size_px)[None], np.eye(4)[None], places, drawn, np.zeros_like(drawn)
+    )
     free = np.ones((1, 9), dtype=np.bool_)
     free[0, 8] = False
     # From a lens without distortion everything is wrong a little: k1 must be found before outliers can be detected.

@@ -147,7 +147,7 @@ def result(fit: CamerasFit, held: Mapping[str, Float]) -> CamerasResult:
     """The numbers of a fit.
 
     Raises:
-        FitError: A focal length is not determined, a lens is barely covered, or it folds.
+        FitError: A focal length is not determined, or a lens folds.
     """
     names = fit.views.cameras
     bundle = fit.solution.bundle
@@ -211,23 +211,15 @@ def _lens(fit: CamerasFit, index: int, estimated: bool) -> LensResult:
 
 
 def _check_determined(camera: str, focal_sd: float, covered: Coverage, views: int) -> None:
-    what = ""
     most_focal_sd = 0.01  # of the focal length: one percent of every depth
     least_tilt_deg = 10.0
-    least_cover = 0.25
     if covered.tilt_spread_deg < least_tilt_deg or not focal_sd <= most_focal_sd:
-        what = (
-            f"the focal length is not determined (standard deviation {min(100 * focal_sd, 999):.2g} %, at most"
-            f" {100 * most_focal_sd:g} %): the board's tilts lie within {covered.tilt_spread_deg:.0f}° of each other"
-        )
-    elif covered.share < least_cover:
-        what = (
-            f"corners cover {100 * covered.share:.0f} % of the image, at least {100 * least_cover:.0f} %"
-            " are needed: beyond them the distortion would be a guess"
-        )
-    if what:
         advised = advice(covered)
-        raise FitError(f"camera {camera!r}: {what}, in {views} views{'; ' * bool(advised)}{advised}")
+        raise FitError(
+            f"camera {camera!r}: the focal length is not determined (standard deviation"
+            f" {min(100 * focal_sd, 999):.2g} %, at most {100 * most_focal_sd:g} %): the board's tilts lie within"
+            f" {covered.tilt_spread_deg:.0f}° of each other, in {views} views{'; ' * bool(advised)}{advised}"
+        )
 
 
 def _centre_sd(fit: CamerasFit, index: int) -> tuple[Float, float]:
@@ -315,6 +307,9 @@ def _lens_lines(name: str, lens: LensResult) -> Iterator[str]:
     )
     for row in covered.cells:
         yield "    " + "".join("#" if cell else "." for cell in row)
+    little = 0.25  # of the image
+    if lens.estimated and covered.share < little:
+        yield "  beyond these corners the distortion is that of an ordinary lens, no surer than its ± says"
     if advised := advice(covered):
         yield f"  it would gain most if you {advised}"
 

@@ -32,6 +32,7 @@ def _problem(truth: Scene, noise_px: float, seed: int) -> tuple[list[Observation
     drawn = board_corners(truth.board)
     exact = Bundle(
         np.stack(list(truth.lenses.values())),
+        np.tile((np.array(SIZE) - 1.0) / 2.0, (len(truth.lenses), 1)),
         np.stack(list(truth.T_camera_rig.values())),
         truth.T_rig_board,
         drawn,
@@ -86,7 +87,7 @@ def test_derivatives_are_those_of_the_prediction() -> None:
 def test_one_camera_is_calibrated_as_by_opencv() -> None:
     truth = scene(2, cameras=1, views=12)
     observations, start = _problem(truth, 0.2, 2)
-    solution = solve(observations, start, _all_free(1, shape=False))
+    solution = solve(observations, start, _all_free(1, shape=False), sigma_px=0.0)
     objects = [start.drawn_m.astype(np.float32)] * 12
     images = [o.uv.astype(np.float32) for o in observations]
     matrix = np.array([[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]])
@@ -108,7 +109,7 @@ def test_one_camera_is_calibrated_as_by_opencv() -> None:
 def test_two_cameras_are_calibrated_as_by_opencv() -> None:
     truth = scene(3, cameras=2, views=12)
     observations, start = _problem(truth, 0.2, 3)
-    solution = solve(observations, start, _all_free(2, shape=False))
+    solution = solve(observations, start, _all_free(2, shape=False), sigma_px=0.0)
     objects = [start.drawn_m.astype(np.float32)] * 12
     left, right = ([o.uv.astype(np.float32) for o in observations if o.camera == c] for c in (0, 1))
     matrices = [np.array([[lens[0], 0, lens[2]], [0, lens[1], lens[3]], [0, 0, 1]]) for lens in start.lenses]
