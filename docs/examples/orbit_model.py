@@ -72,8 +72,8 @@ class Orbit:
         if self.mode == "taken" and max(far) > 1.0:  # it begins here: what decided is no leap
             self.mode, self._from = ("orbit" if far[0] > far[1] else "zoom"), (at, self._goal)
         elif self.mode != "taken":
-            rotated = moved[[0, 1, 3]] * ([1, 1, 0] if self.mode == "orbit" else [0, 0, 1])
-            self._goal = np.clip(goal + self._gain * rotated, -MOST, MOST)
+            part = self._gain * ([1, 1, 0] if self.mode == "orbit" else [0, 0, 1])
+            self._goal = np.clip(goal + part * moved[[0, 1, 3]], -MOST, MOST)
         self._past.append((self._t_ns, self._goal))
 
     def glide(self, seconds: float) -> None:
@@ -114,11 +114,10 @@ def run(bus: Bus, orbit: Orbit, show: rr.RecordingStream, go_on: Callable[[], bo
             drawn = orbit.shown
             rotation = axis_rotation(0, drawn[1]) @ axis_rotation(1, drawn[0])
             show.log("model", rr.Transform3D(mat3x3=rotation * math.exp(drawn[2])))
-        text = HELP.get(orbit.mode, orbit.mode) if there else "waiting for a master ..."
+        text, last_s = HELP.get(orbit.mode, orbit.mode) if there else "waiting for a master ...", now_s
         if text != shown:
-            show.log("said", rr.TextDocument(text))
+            show.log("said", rr.TextDocument(shown := text))
             sys.stderr.write(f"{text}\n")
-        shown, last_s = text, now_s
 
 
 def main() -> None:
@@ -134,10 +133,10 @@ def main() -> None:
         data = options.model.read_bytes() if options.model else None
         model = chair() if data is None else rr.Asset3D(contents=data, media_type="model/gltf-binary")
         with closing(ViewerProcess(options.web)) as viewer:
-            sys.stderr.write(f"{viewer.address}\n")
             show = rr.RecordingStream("orbit_model")
             show.connect_grpc(viewer.url)
             show_model(show, model, options.radius)
+            sys.stderr.write(f"{viewer.address}\n")
             try:
                 run(ZenohBus(None, options.bus), Orbit(mirror=options.mirror), show, viewer.alive)
             except KeyboardInterrupt:
