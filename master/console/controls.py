@@ -143,14 +143,19 @@ class CameraView(Element, component="static/camera_view.js"):
     """Live camera picture while the page is visible; `on_pick`: points can be picked."""
 
     def __init__(
-        self, camera: str, label: str, on_pick: Callable[[float, float, int], object] | None = None
+        self,
+        camera: str,
+        label: str,
+        on_pick: Callable[[float, float, int], object] | None = None,
+        *,
+        pause_ms: int = 0,
     ) -> None:
-        """Show `camera`, to a screen reader as `label`.
+        """Show `camera`, to a screen reader as `label`, a picture at most each `pause_ms`.
 
         `on_pick` gets the place in the picture, as shares (0..1) of its width and height, and its time [ns].
         """
         super().__init__()
-        self._props.update(camera=camera, label=label, mask=[], picks=on_pick is not None)
+        self._props.update(camera=camera, label=label, mask=[], picks=on_pick is not None, pause=pause_ms)
         if on_pick is not None:
             self.on("pick", lambda event: on_pick(*_place(event)))
 

@@ -69,7 +69,8 @@ class _ColourChoice:
         self._box.clear()
         with self._box:
             label = "Picture of the camera: click on the marker"
-            self._view = CameraView(self._camera, label, self._pick)
+            # Nothing moves here: few pictures leave the machine to the cameras, which it may be that runs them.
+            self._view = CameraView(self._camera, label, self._pick, pause_ms=250)
         self._markers.set_value(self._rig.markers[0])
         self._show_state()
 
@@ -86,7 +87,7 @@ class _ColourChoice:
         if not await self._desk.attempt(lambda: state.pick(camera, marker, x, y, t_ns)):
             return
         known = self._known[camera]
-        known |= state.tuner(camera).now.markers.keys()
+        known.update(state.tuner(camera).now.markers)  # `|=` with the keys of a dict would make another set
         self._picked.add(camera)
         ui.notify(f"{camera}: {marker} is known", type="positive")
         if missing := [name for name in self._rig.markers if name not in known]:

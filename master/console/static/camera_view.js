@@ -14,7 +14,7 @@ export default {
       </svg>
       <div v-if="note" class="camera-note" role="status">{{ note }}</div>
     </div>`,
-  props: { camera: String, mask: Array, picks: Boolean, label: String },
+  props: { camera: String, mask: Array, picks: Boolean, label: String, pause: Number }, // [ms] before the next picture
   data() {
     return { x: 0.5, y: 0.5, focused: false, shown: false, note: "waiting for a picture …" };
   },
@@ -50,7 +50,7 @@ export default {
         const img = this.$refs.img;
         const next = () => {
           URL.revokeObjectURL(url);
-          if (socket.readyState === WebSocket.OPEN) socket.send("next");
+          setTimeout(() => socket.readyState === WebSocket.OPEN && socket.send("next"), this.pause || 0);
         };
         img.onload = () => { this.shown = true; this.taken = taken; this.note = ""; next(); };
         img.onerror = next;
