@@ -6,15 +6,13 @@
 import argparse
 import importlib
 import json
-import os
-import platform
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from time import monotonic
 from typing import Any, cast
 
-from bench.report import Row, show, write_json
+from bench.report import Row, machine, show, write_json
 
 # Group -> name -> (module, what it measures). A module has `rows()`, or its own command line `main(arguments)`.
 COMMANDS: dict[str, dict[str, tuple[str, str]]] = {
@@ -85,25 +83,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given and given[0] in ALL and _own_options(module := _module(given[0]), given[1:]):
         return int(module.main(given[1:]) or 0)
-    groups = "\n".join(
-        f"{group}:\n" + "\n".join(f"  {name:18s} {what}" for name, (_, what) in names.items())
-        for group, names in COMMANDS.items()
-    )
-    parser = argparse.ArgumentParser(
-        prog="python -m bench",
-        description=__doc__,
-        epilog=groups,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "names", nargs="*", metavar="NAME", help="one of those below (default: all with rows)"
-    )
+    groups = ""
+    for group, known in COMMANDS.items():
+        groups += f"{group}:\n" + "".join(f"  {name:18s} {what}\n" for name, (_, what) in known.items())
+    keep = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("python -m bench", None, __doc__, groups, formatter_class=keep)
+    parser.add_argument("names", nargs="*", metavar="NAME", help="of those below (default: all with rows)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows to FILE as well")
     options = parser.parse_args(given)
     names = cast(list[str], options.names) or [name for name in ALL if hasattr(_module(name), "rows")]
     if unknown := sorted(set(names) - ALL.keys()):
         parser.error(f"unknown benchmark {unknown[0]!r}; there are {', '.join(ALL)}")
-    print(f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}")
+    print("{machine}, {cores} cores, Python {python}".format(**machine()))
     tables: dict[str, list[Row]] = {}
     for name in names:
         print(f"\n{name}: {ALL[name][1]}", flush=True)

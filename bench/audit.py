@@ -101,9 +101,8 @@ def judge(versions: dict[str, str], answered: Sequence[Package], who: dict[str, 
             lines.append(f"{name} {versions[name]} (for {who.get(name, '?')}): {names}; mended by {fix}")
     missing = sorted(set(versions) - set(answers))
     if lines:
-        return Verdict(
-            KNOWN, (*lines, f"{len(lines)} known; raise the lines of constraints.txt, then `make test`")
-        )
+        what = f"{len(lines)} known; raise the lines of constraints.txt, then `make test`"
+        return Verdict(KNOWN, (*lines, what))
     if missing:
         few = ", ".join(missing[:5]) + (" ..." if len(missing) > 5 else "")
         return Verdict(NOT_ASKED, (f"nothing is known of {len(missing)} of {len(versions)} packages: {few}",))
@@ -111,7 +110,7 @@ def judge(versions: dict[str, str], answered: Sequence[Package], who: dict[str, 
 
 
 def bill_of_materials(versions: dict[str, str], who: dict[str, str]) -> str:
-    """CycloneDX JSON of what is locked; the property `phalanx:for` says who needs it."""
+    """CycloneDX JSON of what is locked; the property `phalanx:for` names who needs it."""
     scope = {"slave": "required", "master": "required", "extra": "optional", "tests": "excluded"}
     components = [
         {
@@ -191,9 +190,8 @@ def scopes(pyproject: Path, names: Mapping[str, str]) -> dict[str, str]:
     """Name -> who needs it: `slave`, `master`, `extra` (one that a user chooses), or `tests`."""
     groups = wanted(pyproject)
     slave, master = closure(groups[""]), closure(groups["master"])
-    chosen = closure(
-        one for extra, every in groups.items() if extra not in ("", "master", "dev") for one in every
-    )
+    others = groups.keys() - {"", "master", "dev"}
+    chosen = closure(one for extra in others for one in groups[extra])
     ranks = (("slave", slave), ("master", master), ("extra", chosen))
     return {name: next((rank for rank, held in ranks if name in held), "tests") for name in names}
 
@@ -201,12 +199,9 @@ def scopes(pyproject: Path, names: Mapping[str, str]) -> dict[str, str]:
 def main(arguments: Sequence[str]) -> int:
     """Ask the services one after the other, until one knows of all; print, and return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m bench audit", description=__doc__)
-    parser.add_argument("--constraints", type=Path, default=ROOT / "constraints.txt", help="what is locked")
-    parser.add_argument(
-        "--sbom", type=Path, metavar="FILE", help="also write the bill of materials, CycloneDX JSON"
-    )
-    given = parser.parse_args(arguments)
-    versions = locked(given.constraints)
+    parser.add_argument("--sbom", type=Path, metavar="FILE", help="also write the bill of materials")
+    given, constraints = parser.parse_args(arguments), ROOT / "constraints.txt"
+    versions = locked(constraints)
     who = scopes(ROOT / "pyproject.toml", versions)
     if given.sbom is not None:
         given.sbom.write_text(bill_of_materials(versions, who), encoding="utf-8")
@@ -214,7 +209,7 @@ def main(arguments: Sequence[str]) -> int:
     verdict = Verdict(NOT_ASKED, ())
     for service in SERVICES:
         try:
-            verdict = judge(versions, asked(given.constraints, service), who)
+            verdict = judge(versions, asked(constraints, service), who)
         except PhalanxError as error:
             verdict = Verdict(NOT_ASKED, (str(error),))
         for line in verdict.lines:

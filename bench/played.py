@@ -3,15 +3,16 @@
 Without clocks and network, so that the same scene gives the same figures.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from common.arrays import Float, Int
+from common.arrays import Float, Image, Int
 from common.hand.model import HandModel
 from common.messages import HandPose, MarkerDetections
 from common.sim.motion import HandState, base_pose, smooth_step
+from common.sim.painter import MarkerView
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from master.rig.pipeline import build_pipeline
@@ -43,6 +44,18 @@ class HeldPoses:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Course:
+    """A motion by where the hand is at each time [s]."""
+
+    where: Callable[[float], HandState]
+    period_s: float = 60.0
+
+    def at(self, t_s: float) -> HandState:
+        """Return the hand at time `t_s` [s]."""
+        return self.where(t_s)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Watched:
     """One camera over T frames of a scene.
 
@@ -63,23 +76,35 @@ def times_of(scene: Scene, camera: str, seconds: float, rate_hz: float, start_s:
 def shown_by(scene: Scene, camera: str, times_s: Float) -> Float:
     """Return exact visibility alone, (T, M) as in `Watched`; nothing is drawn."""
     renderer = Renderer(scene, camera)
-    return np.array([_shown(scene, camera, renderer, float(t)) for t in times_s])
+    return np.array([_shown(scene, camera, renderer.markers(t), t) for t in times_s.tolist()])
+
+
+def observed(
+    scene: Scene, camera: str, times_s: Float, push: Callable[[Image, int], Detections] | None = None
+) -> Iterator[tuple[MarkerDetections, MarkerView, Image]]:
+    """Render and detect the frames of one camera: what its slave would send, what is in sight, the frame.
+
+    `push`: of a detector; None: the one of a slave.
+    """
+    renderer, own = Renderer(scene, camera), scene.cameras[camera]
+    if push is None:
+        push = detector_for(own, scene.rig.markers, Inline(), free=scene.rig.free_markers).push
+    for seq, t in enumerate(times_s.tolist()):
+        t_ns, (image, view) = START_NS + round(t * 1e9), renderer.observe(t)
+        yield message_of(camera, seq, t_ns, push(image, t_ns)), view, image
 
 
 def found_by(scene: Scene, camera: str, times_s: Float) -> list[MarkerDetections]:
-    """Render and detect the frames of one camera."""
-    renderer = Renderer(scene, camera)
-    detector = detector_for(scene.cameras[camera], scene.rig.markers, Inline(), free=scene.rig.free_markers)
-    messages: list[MarkerDetections] = []
-    for seq, t in enumerate(times_s.tolist()):
-        t_ns = START_NS + round(t * 1e9)
-        messages.append(message_of(camera, seq, t_ns, detector.push(renderer.render(t), t_ns)))
-    return messages
+    """Return what the slave of one camera would send."""
+    return [message for message, _, _ in observed(scene, camera, times_s)]
 
 
 def watch(scene: Scene, camera: str, times_s: Float) -> Watched:
     """Render and detect the frames of one camera, with exact visibility beside them."""
-    return Watched(tuple(found_by(scene, camera, times_s)), times_s, shown_by(scene, camera, times_s))
+    found = list(observed(scene, camera, times_s))
+    seen = zip(found, times_s.tolist(), strict=True)
+    shown = [_shown(scene, camera, view, t_s) for (_, view, _), t_s in seen]
+    return Watched(tuple(message for message, _, _ in found), times_s, np.array(shown))
 
 
 def message_of(camera: str, seq: int, t_ns: int, found: Detections) -> MarkerDetections:
@@ -102,8 +127,7 @@ def times_of_poses(poses: Sequence[HandPose]) -> Float:
     return np.asarray((stamps - START_NS) * 1e-9, np.float64)
 
 
-def _shown(scene: Scene, camera: str, renderer: Renderer, t_s: float) -> Float:
-    view = renderer.markers(t_s)
+def _shown(scene: Scene, camera: str, view: MarkerView, t_s: float) -> Float:
     shown = view.visible.copy()
     rows_s = 0.02  # a marker's row is exposed within this time after row 0
     joints = scene.truth(t_s + rows_s / 2).joints

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
+from bench.aarch64.guest import StillClock
 from bench.both.scene import shown
 from bench.report import ROOT, Row
 from bench.rigs.rooms import ROOM, detections, in_order, room
-from common.clock import Clock
 from common.messages import ImuSample, encode
 from master.rig.setup import RigSetup, load_setups
 from master.run.app import StageTimes, result_at
@@ -49,7 +49,6 @@ FIGURES = {
 _TURN = 10  # the first turn warms up
 _SCENE, _SEED = "grasp", 7
 _KEY, _MASTER, _BROADCAST = bytes(range(32)), ("10.0.0.1", 47801), ("10.0.0.255", 47800)
-_BEGIN_NS = 10**12
 # numba takes part of its time when it is imported, the rest where kernels are first called.
 _START = """
 from time import process_time
@@ -66,22 +65,12 @@ print(spent_s + process_time() - began_s)
 """
 
 
-class _Clock(Clock):
-    """A clock that shows what it is set to."""
-
-    def __init__(self) -> None:
-        self.t_ns = _BEGIN_NS
-
-    def now_ns(self) -> int:
-        return self.t_ns
-
-
 class Played:
-    """The master of a rig and its senders, all in one thread. Holds them, and the time that they believe it is."""
+    """The master of a rig and its senders, all in one thread. Holds them, and the time on their clock."""
 
     def __init__(self, setups: Sequence[RigSetup], stages: StageTimes) -> None:
         """Join them, and let them find each other."""
-        self._clock, source = _Clock(), random.Random(_SEED).randbytes
+        self._clock, source = StillClock(), random.Random(_SEED).randbytes
         cameras = tuple(dict.fromkeys(name for setup in setups for name in setup.camera_names))
         imus = tuple(name for setup in setups for name in setup.imus)
         wrists = tuple(name for setup in setups for name in setup.wrist_cameras)
@@ -91,7 +80,7 @@ class Played:
         self._address = {name: (f"10.0.1.{k}", 5) for k, name in enumerate(self._slaves)}
         self._world = Dispatcher(setups, [LivePipeline(setup, stages) for setup in setups], stages)
         while not all(slave.started for slave in self._slaves.values()):
-            if self._clock.t_ns > _BEGIN_NS + 2 * 10**9:
+            if self._clock.t_ns > StillClock.t_ns + 2 * 10**9:
                 raise RuntimeError("the master's start did not come within two simulated seconds")
             self._clock.t_ns += 5_000_000
             self._keep()
@@ -121,7 +110,7 @@ class Played:
         return poses
 
     def _keep(self) -> None:
-        """Carry what the links say to each other by themselves."""
+        """Carry what the links send each other by themselves."""
         t_ns = self._clock.t_ns
         for datagram, to in self._master.due():
             for name, slave in self._slaves.items():

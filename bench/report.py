@@ -3,11 +3,13 @@
 import json
 import math
 import os
+import platform
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -15,6 +17,11 @@ from matplotlib.figure import Figure
 
 from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Arrays = TypeVar("Arrays", bound="DataclassInstance")
 
 ROOT = Path(__file__).resolve().parents[1]
 CALIBRATION = ROOT / "calib_json"
@@ -54,6 +61,16 @@ def command(module: str, *arguments: object) -> None:
     subprocess.run(words, check=True, capture_output=True, cwd=ROOT)
 
 
+def detect(folder: Path, camera: str, target: Path, *options: object) -> None:
+    """Have the slave find in a recording what it finds; `target`: where to."""
+    command("slave", "run", "--name", camera, "--camera", f"replay:{folder}", *options, "-o", target)
+
+
+def machine() -> dict[str, object]:
+    """Return what a figure that depends on the machine was measured on."""
+    return {"machine": platform.machine(), "cores": os.cpu_count(), "python": platform.python_version()}
+
+
 def show(rows: Iterable[Row]) -> list[Row]:
     """Print rows as they are measured; return them."""
     out: list[Row] = []
@@ -66,13 +83,13 @@ def show(rows: Iterable[Row]) -> list[Row]:
 
 def write_json(file: Path, tables: Mapping[str, Sequence[Row]]) -> None:
     """Write rows by section; null stands for a value that could not be measured."""
-    plain = {
-        name: [
-            row._asdict() | {"value": float(row.value) if math.isfinite(row.value) else None} for row in rows
-        ]
-        for name, rows in tables.items()
-    }
-    file.write_text(json.dumps(plain, indent=1, allow_nan=False))
+
+    def plain(row: Row) -> dict[str, object]:
+        fields: dict[str, object] = row._asdict()
+        return fields | {"value": float(row.value) if math.isfinite(row.value) else None}
+
+    found = {name: [plain(row) for row in rows] for name, rows in tables.items()}
+    file.write_text(json.dumps(found, indent=1, allow_nan=False))
 
 
 def figure(width: float, height: float) -> Figure:
@@ -91,3 +108,14 @@ def rms(values: Float | Sequence[float]) -> float:
 def inside(chi2: Float) -> float:
     """Return the share of squared errors (N,), in units of covariance, inside the 95 % region [%]."""
     return 100.0 * float((chi2 < REGION).mean())
+
+
+def chi_squares(off: Float, cov: Float) -> Float:
+    """Return squared errors (..., n) in units of their covariances (..., n, n)."""
+    return np.vecdot(off, np.linalg.solve(cov, off[..., None])[..., 0])
+
+
+def joined(parts: Sequence[Arrays]) -> Arrays:
+    """Return dataclasses of arrays as one, each array end to end."""
+    names = [field.name for field in fields(parts[0])]
+    return replace(parts[0], **{n: np.concatenate([getattr(one, n) for one in parts]) for n in names})

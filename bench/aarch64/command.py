@@ -106,32 +106,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("cases", nargs="*", metavar="CASE", help=f"{' '.join(CASES)} (default: all)")
     parser.add_argument("--record", action="store_true", help="write the baseline")
-    parser.add_argument("--cpu", default=CPU, help="QEMU's name of the processor (default: %(default)s)")
     options = parser.parse_args(arguments)
     cases = cast(list[str], options.cases) or list(CASES)
     if unknown := sorted(set(cases) - CASES.keys()):
         parser.error(f"no case {unknown[0]!r}; there are {', '.join(CASES)}")
-    if options.record and (options.cpu != CPU or set(cases) != CASES.keys()):
-        parser.error(f"the baseline holds every case on {CPU}: --record goes with no CASE and no --cpu")
+    if options.record and set(cases) != CASES.keys():
+        parser.error("the baseline holds every case: --record goes with no CASE")
     try:
-        return _count(cases, record=options.record, cpu=options.cpu)
+        return _count(cases, record=options.record)
     except (NotPossibleError, BaselineError) as error:
         print(f"instructions: {error}", file=sys.stderr)
         return 2
 
 
-def _count(cases: list[str], *, record: bool, cpu: str) -> int:
-    old = read() if cpu == CPU and not record else None
+def _count(cases: list[str], *, record: bool) -> int:
+    old = None if record else read()
     sysroot = prepare(_print)
     fast = fast_wheels(_print) if set(cases) & set(MACHINE_CODE) else None
     with tempfile.TemporaryDirectory(dir=CACHE, prefix="frames-") as folder:
         scene.write_all(Path(folder))
         equal = [case for case in cases if case not in MACHINE_CODE]  # whose sums may be in any order
         here = native(Path(folder), equal)
-        found = counted(sysroot, Path(folder), cases, cpu, fast)
-    print(f"aarch64 instructions per frame, 640x480, {cpu}, QEMU {sysroot.versions['qemu']}")
+        found = counted(sysroot, Path(folder), cases, fast)
+    print(f"aarch64 instructions per frame, 640x480, {CPU}, QEMU {sysroot.versions['qemu']}")
     _print_table(cases, found, old)
-    new = Baseline(cpu, {case: round(found.per_frame[case]) for case in cases}, sysroot.versions)
+    new = Baseline(CPU, {case: round(found.per_frame[case]) for case in cases}, sysroot.versions)
     good = _same_everywhere(equal, found.hashes, here)
     if record:
         write(new)

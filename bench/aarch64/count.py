@@ -32,9 +32,7 @@ class _Run(NamedTuple):
     digest: str
 
 
-def counted(
-    sysroot: Sysroot, frames: Path, cases: Sequence[str], cpu: str = CPU, fast: Path | None = None
-) -> Counted:
+def counted(sysroot: Sysroot, frames: Path, cases: Sequence[str], fast: Path | None = None) -> Counted:
     """Run `cases` under emulation, each in a process of its own: what ran before moves a count by some 1e-3.
 
     `fast`: folder of the wheels of machine code. One such case runs uncounted first: what was compiled in the same
@@ -42,10 +40,10 @@ def counted(
     """
     compiled = [case for case in cases if case in MACHINE_CODE]
     if compiled:
-        _emulated(sysroot, frames, compiled[0], cpu, fast)
+        _emulated(sysroot, frames, compiled[0], fast)
     at_once = 2  # runs side by side
     with ThreadPoolExecutor(at_once) as pool:
-        running = {case: pool.submit(_emulated, sysroot, frames, case, cpu, fast) for case in cases}
+        running = {case: pool.submit(_emulated, sysroot, frames, case, fast) for case in cases}
         answers = {case: run.result() for case, run in running.items()}
     slopes: dict[str, float] = {}
     for case, (labels, counts, _) in answers.items():
@@ -59,10 +57,10 @@ def native(frames: Path, cases: Sequence[str]) -> dict[str, str]:
     return {case: _ask([sys.executable], frames, case, os.environ)[1] for case in cases}
 
 
-def _emulated(sysroot: Sysroot, frames: Path, case: str, cpu: str, fast: Path | None) -> _Run:
+def _emulated(sysroot: Sysroot, frames: Path, case: str, fast: Path | None) -> _Run:
     with tempfile.TemporaryDirectory() as folder:
         marks = Path(folder) / "marks"
-        qemu = [*sysroot.qemu, "-cpu", cpu, "-L", str(sysroot.root)]
+        qemu = [*sysroot.qemu, "-cpu", CPU, "-L", str(sysroot.root)]
         plugin = ["-plugin", f"file={sysroot.plugin},to={marks}"]
         python = [str(sysroot.root / f"usr/bin/python{PYTHON}"), "-s", "-S"]
         # Compiled modules go to a place of their own: the emulated Python's own path may be the machine's as well.

@@ -79,12 +79,13 @@ def arrays_of(message: Message) -> list[np.ndarray]:
     return [value.astype(float) for value in values if isinstance(value, np.ndarray)]
 
 
-class _StillClock(Clock):
+class StillClock(Clock):
     """A clock that shows what it is set to, so that an emulated minute ends no session."""
 
     t_ns = 1_000_000_000_000
 
     def now_ns(self) -> int:
+        """Return what it is set to."""
         return self.t_ns
 
 
@@ -92,7 +93,7 @@ class _Wire:
     """Where the slave's loop sends to: a started link, all of `Uplink.send` save the socket. Holds what was sent."""
 
     def __init__(self, camera: str) -> None:
-        clock = _StillClock()
+        clock = StillClock()
         source = random.Random(7).randbytes
         master = MasterLink((camera,), KEY, clock, ("10.0.0.255", 47800), "tcp/10.0.0.1:47802", 0, source)
         self._link = SlaveLink(camera, KEY, clock, source)
@@ -160,13 +161,8 @@ def run_case(case: str, folder: Path, marks: Marks) -> str:
         each(lambda k: digest.add(published.detect(frames.image(k), ranges)))
     elif case == "step":
         wire = _Wire(frames.camera.name)
-        run(
-            _Source(frames, mark),
-            MarkerPipeline(
-                frames.camera.name, wire.session, wire.send, detector.push, DetectionCounters(frames.names)
-            ),
-            threading.Event(),
-        )
+        line = (wire.session, wire.send, detector.push, DetectionCounters(frames.names))
+        run(_Source(frames, mark), MarkerPipeline(frames.camera.name, *line), threading.Event())
         digest.add(np.frombuffer(b"".join(wire.datagrams), np.uint8))
     else:
         raise ValueError(f"no case {case!r}")

@@ -24,15 +24,7 @@ PLUGIN = Path(__file__).with_name("count.c")
 SUITE, MIRROR, PYTHON = "bookworm", "http://deb.debian.org/debian", "3.11"  # Raspberry Pi OS 12
 PACKAGES = ("python3", "libgomp1", "libstdc++6")
 # What the slave needs: `dependencies` of pyproject.toml, and what those need.
-WHEELS = (
-    "cryptography",
-    "eclipse-zenoh",
-    "msgspec",
-    "numpy",
-    "opencv-python-headless",
-    "pyserial",
-    "smbus2",
-)
+WHEELS = ("cryptography", "eclipse-zenoh", "msgspec", "numpy", "opencv-python-headless", "pyserial", "smbus2")
 WHEELS_OF_WHEELS = ("cffi", "pycparser")
 FAST = ("llvmlite", "numba")  # those of the extra `fast`, beside the others and only where a case needs them
 UNREACHABLE = ("resolve", "connect", "unreachable", "NewConnectionError", "timed out")
@@ -43,7 +35,7 @@ HOSTS = {"x86_64": ("amd64", "ld-linux-x86-64.so.2"), "aarch64": ("arm64", "ld-l
 
 
 class NotPossibleError(Exception):
-    """Nothing can be emulated here; the message says what is missing and how to get it."""
+    """Nothing can be emulated here; the message names what is missing and how to get it."""
 
 
 class NoNetworkError(NotPossibleError):
@@ -78,9 +70,7 @@ def prepare(notify: Callable[[str], None]) -> Sysroot:
             f"missing here: {', '.join(absent)}; on Debian: apt install {' '.join(absent)}"
         )
     if platform.machine() not in HOSTS:
-        raise NotPossibleError(
-            f"Debian has no QEMU for {platform.machine()}; there is one for {', '.join(HOSTS)}"
-        )
+        raise NotPossibleError(f"Debian has QEMU for {', '.join(HOSTS)}, not for {platform.machine()}")
     CACHE.mkdir(parents=True, exist_ok=True)
     with (CACHE / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
@@ -92,17 +82,13 @@ def _prepared(notify: Callable[[str], None]) -> Sysroot:
     root = _debian("arm64", PACKAGES, notify)
     tools = _debian(architecture, ("qemu-user",), notify)
     names = [*WHEELS, *WHEELS_OF_WHEELS]
-    wheels = _made(
-        "wheels", f"{PYTHON} {WHEELS} {_pins(names)}", lambda place: _download(place, WHEELS), notify
-    )
+    inputs = f"{PYTHON} {WHEELS} {_pins(names)}"
+    wheels = _made("wheels", inputs, lambda place: _download(place, WHEELS), notify)
     plugin = _made("plugin", PLUGIN.read_text(), _compile_plugin, notify)
     triplet = f"{platform.machine()}-linux-gnu"
     # The loader by its real path: the usual one is a link to / and would be the machine's own, of another libc.
-    start = (
-        f"{tools}/lib/{triplet}/{loader}",
-        "--library-path",
-        f"{tools}/lib/{triplet}:{tools}/usr/lib/{triplet}",
-    )
+    libraries = f"{tools}/lib/{triplet}:{tools}/usr/lib/{triplet}"
+    start = (f"{tools}/lib/{triplet}/{loader}", "--library-path", libraries)
     qemu = (*start, f"{tools}/usr/bin/qemu-aarch64")
     packages = {
         "qemu": _version(tools, "qemu-user"),
@@ -140,13 +126,12 @@ def fast_wheels(notify: Callable[[str], None]) -> Path:
     """Make the folder of the extra `fast` (200 MB) if it is not there; errors as of `prepare`."""
     with (CACHE / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        return _made(
-            "fast", f"{PYTHON} {_pins(FAST)}", lambda place: _download(place, FAST, "--no-deps"), notify
-        )
+        inputs = f"{PYTHON} {_pins(FAST)}"
+        return _made("fast", inputs, lambda place: _download(place, FAST, "--no-deps"), notify)
 
 
 def _pins(names: Sequence[str]) -> list[str]:
-    """The lines of constraints.txt that say which wheels."""
+    """The lines of constraints.txt of some wheels."""
     return re.findall(rf"^(?:{'|'.join(names)})==.*$", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
 
 

@@ -21,8 +21,8 @@ from typing import Self
 
 import numpy as np
 
-from bench.played import START_NS, message_of, times_of
-from bench.report import CALIBRATION
+from bench.played import START_NS, observed, times_of
+from bench.report import CALIBRATION, chi_squares
 from common.arrays import Bool, Float, Int
 from common.geometry.transforms import quaternion_to_matrix
 from common.hand.model import CHAINS, WRIST
@@ -40,8 +40,6 @@ from master.rig.pipeline import pipeline_of
 from master.rig.setup import RigSetup, load_setup
 from master.run.app import StageTimes
 from slave.cameras.synthetic import STROBE
-from slave.markers.reloadable import detector_for
-from slave.markers.white_balance import Inline
 from slave.sources import Frame
 from slave.wrist.detector import WristDetector
 from slave.wrist.led_image import WristView
@@ -77,7 +75,7 @@ class Both:
         return RigSetup.joined([self.markers, self.wrist])
 
     def truth(self, t_ns: int) -> SceneTruth:
-        """The hand, in the rig frame, at an instant of the messages' clock."""
+        """The hand, in the rig frame, at a moment of the messages' clock."""
         return self.scene.truth(1e-9 * (t_ns - START_NS))
 
 
@@ -92,7 +90,7 @@ class Sight:
     tip: Bool  # (K, 5) whether each fingertip is in sight of the wrist camera
 
     def cameras_of(self, t_s: Float, within_s: float) -> Int:
-        """(N, M) how many cameras have each marker (9 px^2) in sight within so long of the instants (N,) [s]."""
+        """(N, M) how many cameras have each marker (9 px^2) in sight within so long of the moments (N,) [s]."""
         count = np.zeros((len(t_s), next(iter(self.visible_px2.values())).shape[1]), np.int64)
         for name, times in self.visible_t_s.items():
             count += _about(t_s, times, self.visible_px2[name] >= 9.0, within_s)
@@ -104,7 +102,7 @@ class Sight:
 
 
 def _about(t_s: Float, times_s: Float, there: Bool, within_s: float) -> Bool:
-    """(N, ...) whether something is there (T, ...) at any of the times (T,) within so long of the instants (N,)."""
+    """(N, ...) whether something is there (T, ...) at any of the times (T,) within so long of the moments (N,)."""
     first, last = (np.searchsorted(times_s, t_s + way * within_s) for way in (-1.0, 1.0))
     total = np.concatenate([np.zeros((1, *there.shape[1:]), np.int64), np.cumsum(there, axis=0)])
     return np.asarray(total[last] > total[first])
@@ -163,16 +161,16 @@ def shown(name: str, seconds: float, seed: int, every: int = 1) -> Shown:
 def shown_of(both: Both, seconds: float, every: int = 1) -> Shown:
     """The same of a scene before other rigs."""
     messages = orientations(both, seconds)
-    times, marker_colour = dict[str, Float](), dict[str, Float]()
+    times, paint = dict[str, Float](), dict[str, Float]()
     for camera in both.markers.rig.cameras:
         rate = both.markers.cameras[camera].frame_rate_hz / every
         times[camera] = times_of(both.scene, camera, seconds, rate)
-        found, marker_colour[camera] = markers_shown(both.scene, camera, times[camera], 1.0 / rate, both.seed)
+        found, paint[camera] = markers_shown(both.scene, camera, times[camera], 1.0 / rate, both.seed)
         messages += found
     frame_s = 1.0 / both.wrist.cameras[both.wrist.rig.cameras[0]].frame_rate_hz
     line_t = np.arange(1.0, seconds / frame_s - 1.0, 3.0) * frame_s
     cycles, line, tip = _cycles(both, line_t, frame_s)
-    return Shown(both, seconds, in_order(messages + cycles), Sight(times, marker_colour, line_t, line, tip))
+    return Shown(both, seconds, in_order(messages + cycles), Sight(times, paint, line_t, line, tip))
 
 
 def markers_shown(
@@ -188,12 +186,17 @@ def markers_shown(
     marker_colour: list[Float] = []
     for seq, t in enumerate(times_s.tolist()):
         view = renderer.markers(t)
-        marker_colour.append(np.where(np.isfinite(view.uv[:, 0]), view.area, 0.0))
+        marker_colour.append(_paint(view))
         off = 0.8 * lasting() + 0.6 * rng.normal(size=(count, 2))
         spot_px2, spot_spread_px2 = 15.5, 4.0  # of paint that is found half of the time
         found = view.area > spot_px2 + spot_spread_px2 * least()
         out.append(_marker_message(camera, seq, START_NS + round(t * 1e9), view, found, off))
     return out, np.array(marker_colour)
+
+
+def _paint(view: MarkerView) -> Float:
+    """The paint (M,) in sight [px^2]."""
+    return np.where(np.isfinite(view.uv[:, 0]), view.area, 0.0)
 
 
 def _marker_message(
@@ -205,18 +208,10 @@ def _marker_message(
     small = (whole_px2 / np.maximum(view.area, 1.0)) ** 1.4
     sigma = np.clip(whole_px * small, whole_px, speck_px)
     of_claimed = 0.6  # how large errors are by what is claimed
-    return MarkerDetections(
-        camera=camera,
-        session=1,
-        seq=seq,
-        t_ns=t_ns,
-        ready_t_ns=t_ns,
-        uv=np.where(found[:, None], view.uv + (of_claimed * sigma)[:, None] * off, np.nan),
-        area=np.where(found, view.area, np.nan),
-        quality=np.where(found, np.clip(view.area / whole_px2, 0.1, 1.0), np.nan),
-        sigma_px=np.where(found, sigma, np.nan),
-        alt_uv=np.full((len(found), 2), np.nan),
-    )
+    uv = np.where(found[:, None], view.uv + (of_claimed * sigma)[:, None] * off, np.nan)
+    area, quality = np.where(found, view.area, np.nan), np.clip(view.area / whole_px2, 0.1, 1.0)
+    quality, sigma = (np.where(found, value, np.nan) for value in (quality, sigma))
+    return MarkerDetections(camera, 1, seq, t_ns, t_ns, uv, area, quality, sigma, np.full_like(uv, np.nan))
 
 
 def _cycles(both: Both, times_s: Float, frame_s: float) -> tuple[list[Observed], Float, Bool]:
@@ -252,19 +247,8 @@ class _WristErrors:
         tip, tip_sigma = self._tips(led)
         depth_unit, depth_noise = 0.8, 0.04
         depth = depth_unit * led.tip_xyz[:, 2] * (1.0 + depth_noise * self._rng.normal(size=5))
-        return WristDetections(
-            camera=self._camera,
-            session=1,
-            seq=seq,
-            t_ns=t_ns,
-            ready_t_ns=ready_ns,
-            laser_uv=at,
-            laser_sigma_px=sigma,
-            laser_px=length,
-            tip_uv=tip,
-            tip_sigma_px=tip_sigma,
-            tip_depth=np.where(np.isnan(tip[:, 0]), np.nan, depth),
-        )
+        depth = np.where(np.isnan(tip[:, 0]), np.nan, depth)
+        return WristDetections(self._camera, 1, seq, t_ns, ready_ns, at, sigma, length, tip, tip_sigma, depth)
 
     def _line(self, truth: WristTruth) -> tuple[Float, Float, Float]:
         other, off = self._other(), 0.8 * self._laser() + 0.6 * self._rng.normal(size=(5, 2))
@@ -301,29 +285,15 @@ class _WristErrors:
 def watched(both: Both, seconds: float) -> Shown:
     """What the slaves report of a scene within its first `seconds`; some seconds for each."""
     messages = orientations(both, seconds)
-    times, marker_colour = dict[str, Float](), dict[str, Float]()
+    times, paint = dict[str, Float](), dict[str, Float]()
     for camera in both.markers.rig.cameras:
         rate = both.markers.cameras[camera].frame_rate_hz
         times[camera] = times_of(both.scene, camera, seconds, rate)
-        found, marker_colour[camera] = _markers(both, camera, times[camera])
-        messages += found
+        found = list(observed(both.scene, camera, times[camera]))
+        paint[camera] = np.array([_paint(view) for _, view, _ in found])
+        messages += [message for message, _, _ in found]
     cycles, line_t, line, tip = cycles_of(both, seconds)
-    return Shown(both, seconds, in_order(messages + cycles), Sight(times, marker_colour, line_t, line, tip))
-
-
-def _markers(both: Both, camera: str, times_s: Float) -> tuple[list[Observed], Float]:
-    """One marker camera's frames, and the paint (T, M) [px^2] in sight."""
-    scene = both.scene
-    renderer = Renderer(scene, camera)
-    detector = detector_for(scene.cameras[camera], scene.rig.markers, Inline(), free=scene.rig.free_markers)
-    out: list[Observed] = []
-    marker_colour: list[Float] = []
-    for seq, t in enumerate(times_s.tolist()):
-        image, view = renderer.observe(t)
-        marker_colour.append(np.where(np.isfinite(view.uv[:, 0]), view.area, 0.0))
-        t_ns = START_NS + round(t * 1e9)
-        out.append(message_of(camera, seq, t_ns, detector.push(image, t_ns)))
-    return out, np.array(marker_colour)
+    return Shown(both, seconds, in_order(messages + cycles), Sight(times, paint, line_t, line, tip))
 
 
 def cycles_of(both: Both, seconds: float) -> tuple[list[Observed], Float, Float, Bool]:
@@ -353,7 +323,7 @@ def _frames(both: Both, name: str, seconds: float) -> Iterator[Frame]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """What a pipeline made of a scene, in the rig frame, and the truth at the same N instants."""
+    """What a pipeline made of a scene, in the rig frame, and the truth at the same N moments."""
 
     poses: Poses  # as published, but a hand that only a wrist device knows put where it truly is
     t_s: Float  # (N,) scene times [s]
@@ -374,15 +344,9 @@ class Solved:
         angles = np.array([state.angles_rad for state in states])
         truth = both.scene.model.forward(np.array([state.T_rig_palm for state in states]), angles)
         placed = _placed(found, truth.position_m[:, WRIST], truth.rotation[:, WRIST])
-        return cls(
-            poses=found if setup.markers else placed,
-            t_s=t_s,
-            truth_m=truth.position_m,
-            placed_m=placed.position_m,
-            truth_rad=angles,
-            markers=bool(setup.markers),
-            wrist=setup.wrist is not None,
-        )
+        by = bool(setup.markers), setup.wrist is not None
+        shown = found if setup.markers else placed
+        return cls(shown, t_s, truth.position_m, placed.position_m, angles, *by)
 
     @property
     def off_mm(self) -> Float:
@@ -409,8 +373,7 @@ class Solved:
         cov = self.poses.cov_m2[:, 1:]
         known = self.poses.valid[:, 1:] & np.isfinite(cov).all(axis=(2, 3)) & np.isfinite(off).all(axis=2)
         safe = np.where(known[..., None, None], cov, np.eye(3))
-        chi = np.vecdot(off, np.linalg.solve(safe, off[..., None])[..., 0])
-        return np.where(known, chi, np.nan)
+        return np.where(known, chi_squares(off, safe), np.nan)
 
     @property
     def steps_mm(self) -> Float:

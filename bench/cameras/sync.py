@@ -14,8 +14,8 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from bench.played import START_NS, Watched, solve, watch
-from bench.report import CALIBRATION, Row, inside, rig_files
+from bench.played import START_NS, Course, Watched, solve, watch
+from bench.report import CALIBRATION, Row, chi_squares, inside, rig_files
 from common.arrays import Bool, Float
 from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections
@@ -113,7 +113,7 @@ class Outcome:
     depth: Float  # (K,) error of the depth [%]
     across_mm: Float  # (K,) error across the sight [mm]
     chi2: Float  # (K,) squared error in units of the claimed covariance
-    waited_s: Float  # (I,) between each instant and the centre row of the frame that completed it [s]
+    waited_s: Float  # (I,) between each moment and the centre row of the frame that completed it [s]
 
     @property
     def covered(self) -> float:
@@ -122,7 +122,7 @@ class Outcome:
 
 
 def outcome(motion: Making, shooting: Shooting, treatment: Treatment, seeds: range) -> Outcome:
-    """Errors over all markers, instants and seeds."""
+    """Errors over all markers, moments and seeds."""
     cameras = load_setup(CALIBRATION, "desk").models
     arrays = CameraArrays.of(tuple(cameras.values()))
     depth: list[Float] = []
@@ -139,7 +139,7 @@ def outcome(motion: Making, shooting: Shooting, treatment: Treatment, seeds: ran
             error = (found.points_m - truth)[ok]
             depth.append(100.0 * error[:, 2] / truth[ok, 2])
             across.append(1e3 * np.hypot(error[:, 0], error[:, 1]))
-            chi2.append(np.einsum("mi,mij,mj->m", error, np.linalg.inv(found.cov_m2[ok]), error))
+            chi2.append(chi_squares(error, found.cov_m2[ok]))
             waited.append(wait_s)
     return Outcome(np.concatenate(depth), np.concatenate(across), np.concatenate(chi2), np.array(waited))
 
@@ -151,7 +151,7 @@ def _epochs(
     treatment: Treatment,
     rng: np.random.Generator,
 ) -> Iterator[tuple[FrameSet, float]]:
-    """Instants of one run, and how long each waited."""
+    """Moments of one run, and how long each waited."""
     streams = [
         list(_stream(name, c, model, motion, shooting, rng))
         for c, (name, model) in enumerate(cameras.items())
@@ -160,13 +160,7 @@ def _epochs(
     if treatment in ("uncorrected", "row time ignored"):
         known = {name: replace(model, row_time_ns=0.0) for name, model in cameras.items()}
     if treatment == "uncorrected":  # the k-th frame with the k-th: all that a common start gives
-        streams = [
-            [
-                msgspec.structs.replace(m, t_ns=START_NS + round(m.seq * 1e9 / shooting.rate_hz))
-                for m in stream
-            ]
-            for stream in streams
-        ]
+        streams = [[_by_number(m, shooting.rate_hz) for m in stream] for stream in streams]
     sync = FrameSync(
         known,
         dict.fromkeys(known, shooting.rate_hz),
@@ -287,30 +281,22 @@ def _errors(name: str, found: Sequence[Outcome], note: str) -> Row:
     return Row(f"{name}: p95", max(p95), "%", f"{spread}; {note}; p95 by offset {by_offset}")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Swing:
+def _swing(setup: RigSetup) -> Course:
     """The resting posture moved along x; the speed at the middle is SPEED_M_S."""
+    angles = angles_of(setup.hand, np.array(REST, np.float64), np.zeros((5, 4)))
 
-    setup: RigSetup
-
-    @property
-    def period_s(self) -> float:
-        """Of the swing [s]."""
-        return 2.0 * np.pi * _AMPLITUDE_M / SPEED_M_S
-
-    def at(self, t_s: float) -> HandState:
-        """Return the hand at time `t_s` [s]."""
+    def where(t_s: float) -> HandState:
         shift = np.array([_AMPLITUDE_M * np.sin(SPEED_M_S / _AMPLITUDE_M * t_s), 0.0, 0.0])
-        posture = np.array(REST, dtype=np.float64)
-        T = base_pose(self.setup.hand, view_centre(self.setup.rig), shift, np.zeros(3))
-        return HandState(T, angles_of(self.setup.hand, posture, np.zeros((5, 4))))
+        return HandState(base_pose(setup.hand, view_centre(setup.rig), shift, np.zeros(3)), angles)
+
+    return Course(where, 2.0 * np.pi * _AMPLITUDE_M / SPEED_M_S)
 
 
 @cache
 def _scene(rate_hz: float) -> tuple[RigSetup, Scene]:
     setup = load_setup(CALIBRATION, "desk")
     cameras = {n: msgspec.structs.replace(c, frame_rate_hz=rate_hz) for n, c in setup.cameras.items()}
-    scene = Scene.of_motion(setup.rig, cameras, rig_files("desk")[2], Swing(setup))
+    scene = Scene.of_motion(setup.rig, cameras, rig_files("desk")[2], _swing(setup))
     return replace(setup, cameras=cameras), scene
 
 
@@ -322,13 +308,15 @@ def _monitored(rate_hz: float, offset_s: float) -> tuple[Watched, ...]:
 
 
 def rendered(rate_hz: float, offset_s: float, treatment: Treatment) -> Float:
-    """Return errors of depth [%] of all caps of a rendered swing at all instants, before the filter."""
+    """Return errors of depth [%] of all caps of a rendered swing at all moments, before the filter."""
     setup, scene = _scene(rate_hz)
     watched = _monitored(rate_hz, offset_s)
     if treatment == "predict":
         setup = replace(setup, rig=msgspec.structs.replace(setup.rig, frame_sync="predict"))
     if treatment == "uncorrected":  # the k-th frame with the k-th of the other camera
-        watched = tuple(_by_number(one, rate_hz) for one in watched)
+        watched = tuple(
+            replace(one, messages=tuple(_by_number(m, rate_hz) for m in one.messages)) for one in watched
+        )
         models: dict[str, CameraModel] = {n: replace(m, row_time_ns=0.0) for n, m in setup.models.items()}
         setup = replace(setup, models=models)
     errors: list[Float] = []
@@ -341,7 +329,6 @@ def rendered(rate_hz: float, offset_s: float, treatment: Treatment) -> Float:
     return np.concatenate(errors)
 
 
-def _by_number(watched: Watched, rate_hz: float) -> Watched:
-    times = [START_NS + round(m.seq * 1e9 / rate_hz) for m in watched.messages]
-    pairs = zip(watched.messages, times, strict=True)
-    return replace(watched, messages=tuple(msgspec.structs.replace(m, t_ns=t) for m, t in pairs))
+def _by_number(message: MarkerDetections, rate_hz: float) -> MarkerDetections:
+    """The message with the time that its number gives it."""
+    return msgspec.structs.replace(message, t_ns=START_NS + round(message.seq * 1e9 / rate_hz))

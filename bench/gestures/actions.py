@@ -1,15 +1,13 @@
 """Pinch, dial, taps and pointing of the scene `gestures`, and false ones of hands that make none; exact truth.
 
 Rendered frames of a marker rig go through the slaves' detectors and the master to the recogniser. The truth is the
-geometry of the true hand alone: a pinch or a touch is a gap between skins below a threshold; a knob is gripped while no
-tip is farther in or out than it may be from where it is when the knob begins to turn; a finger points while its true
-bends show it. Thresholds and holds are those of the settings. An event is late by how long after the truth's it is
-recognised, in frames of 60 Hz; one that nobody made is false. The recordings `leapjs` make no gesture; they are the
-truth, played by our hand, as they are and before a wrist device.
+geometry of the true hand alone, by the thresholds and holds of the settings: gaps between skins, tips that stand about
+a knob, bends. An event is late by how long after the truth's it is recognised, in frames of 60 Hz; one that nobody made
+is false. The recordings `leapjs` make no gesture; they are played by our hand, as they are and before a wrist device.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -45,7 +43,7 @@ class TrueEvent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GestureTruth:
-    """The true hand over T instants."""
+    """The true hand over T moments."""
 
     motion: Gestures  # the scene's
     t_s: Float  # (T,) [s]
@@ -61,16 +59,15 @@ class GestureTruth:
         """The first `seconds` of a scene."""
         t = np.arange(round(seconds * _FINE_HZ)) / _FINE_HZ
         states = [motion.at(float(s)) for s in t]
-        joints = model.forward(
-            np.stack([state.T_rig_palm for state in states]), np.stack([state.angles_rad for state in states])
-        ).position_m
+        palms, angles = (
+            np.stack(each) for each in zip(*((s.T_rig_palm, s.angles_rad) for s in states), strict=True)
+        )
+        joints = model.forward(palms, angles).position_m
         capsules = finger_segments(joints, model.radius_m)
         gap = gaps_between(capsules.of(slice(0, 1), slice(2, 3)), capsules.of(slice(1, 5), slice(0, 3))).gap_m
         seen = cls(motion, t, joints, gap[..., 2], gap.min(axis=-1), ())
-        annotations = (seen._event(one, settings) for one in motion.annotations if one.stop_s < seconds - 1.0)
-        return cls(
-            motion, t, joints, seen.pinch_m, seen.key_m, tuple(one for one in annotations if one is not None)
-        )
+        made = [seen._event(one, settings) for one in motion.annotations if one.stop_s < seconds - 1.0]
+        return replace(seen, events=tuple(one for one in made if one is not None))
 
     def pinch_at(self, t_s: float, finger: str) -> float:
         """The true gap [m] of a pinch of a finger."""
@@ -122,9 +119,8 @@ class GestureTruth:
         own = settings.point
 
         def shape(slack: float) -> Bool:
-            return (bend[:, 0] <= own.stretched_rad + slack) & (bend[:, 1:] >= own.bent_rad - slack).all(
-                axis=1
-            )
+            bent = (bend[:, 1:] >= own.bent_rad - slack).all(axis=1)
+            return (bend[:, 0] <= own.stretched_rad + slack) & bent
 
         return shape(0.0), shape(own.slack_rad)
 
@@ -145,8 +141,6 @@ class Score:
     pinch_mm: list[float] = field(default_factory=lambda: list[float]())
     dial_deg: list[float] = field(default_factory=lambda: list[float]())
     ray_deg: list[float] = field(default_factory=lambda: list[float]())
-    # Of the pointing ray from pose to pose.
-    jitter_deg: list[float] = field(default_factory=lambda: list[float]())
 
     def add(self, found: Sequence[Gesture], truth: GestureTruth) -> None:
         """Compare recognised gestures with the truth."""
@@ -182,7 +176,7 @@ class Score:
         self.late.setdefault(what, []).append(seconds * RATE_HZ)
 
     def _values(self, course: Sequence[Gesture], truth: GestureTruth, end_s: float) -> None:
-        first_s, before = _s(course[0].t_ns), None
+        first_s = _s(course[0].t_ns)
         for one in course:
             t_s = _s(one.t_ns)
             if t_s > end_s:
@@ -195,9 +189,6 @@ class Score:
             elif one.kind == "point":
                 off = one.direction - truth.ray_at(t_s)
                 self.ray_deg.append(float(np.degrees(np.linalg.norm(off))))
-                if before is not None:
-                    self.jitter_deg.append(float(np.degrees(np.linalg.norm(off - before))))
-                before = off
 
     def rows(self, name: str) -> Iterator[Row]:
         """Return the rows of this score."""
@@ -209,7 +200,6 @@ class Score:
             ("pinch distance, error", "mm", self.pinch_mm),
             ("dial, error", "deg", self.dial_deg),
             ("ray, error", "deg", self.ray_deg),
-            ("ray from pose to pose, error", "deg", self.jitter_deg),
         ]
         for what, unit, values in lists:
             if values:

@@ -1,16 +1,11 @@
 """The six study poses as the master recognises them: simulated people before rigs, and recorded hands.
 
-**Rigs**: people with their own bones, solved with bones as a calibration measures them; a wrist device sits a little
-otherwise than its file has it, by the error of `calibrate wrist extrinsics` (docs/calibrate.md). Rendered at 30 Hz;
-hands turn by up to 35 degrees. One rendering serves two rigs: two cameras are half of four, and markers are half of
-what is fused. **Wrist**: trials of the study. A frame is right if the pose held in truth is recognised, from the third
-frame after it was formed on; an episode is right if it is recognised by then. **leapjs**: an event is wrong if the
-recorded joints contradict it by a rule of their own (`agrees`).
-
-    python -m bench gesture_poses --people 20 21 22
+**Rigs**: a person with bones of its own, solved with bones as a calibration measures them; a wrist device sits a little
+otherwise than its file has it. Rendered at 30 Hz; hands turn by up to 35 degrees. **Wrist**: trials of the study. A
+frame is right if the pose held in truth is recognised, from the third frame after it was formed on; an episode is right
+if it is recognised by then. **leapjs**: an event is wrong if the recorded joints contradict it (`agrees`).
 """
 
-import argparse
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -23,7 +18,7 @@ from msgspec.structs import replace
 from bench.both.scene import Both, Observed, cycles_of, in_order, orientations, solve
 from bench.hands.motion import SIGMA_M, Recorded, recordings, track
 from bench.played import START_NS, found_by, times_of
-from bench.report import CALIBRATION, Row, datasets, rig_files, show, skipped
+from bench.report import CALIBRATION, Row, datasets, rig_files, skipped
 from bench.study.trials import Participant, Task, participant, performed, rotated
 from common.arrays import Float
 from common.calibration.gesture_settings import default_gestures
@@ -62,12 +57,6 @@ class RecognisedPoses:
                 self.frames.update((name, found[j] or _NONE) for j in range(begin + formed, k))
             begin = k
 
-    def join(self, other: "RecognisedPoses") -> None:
-        """Count those of others as well."""
-        self.frames.update(other.frames)
-        self.episodes += other.episodes
-        self.in_time += other.in_time
-
     @property
     def right(self) -> float:
         """Percent of the frames."""
@@ -94,31 +83,16 @@ class RecognisedPoses:
 
 
 def pose_of(
-    model: HandModel,
-    t_ns: int,
-    place_m: Float,
-    turned_wxyz: Float,
-    angles_rad: Float,
-    sigma_m: float = 2e-3,
+    model: HandModel, t_ns: int, place_m: Float, turned_wxyz: Float, angles_rad: Float, sigma_m: float = 2e-3
 ) -> HandPose:
     """Return the pose of joints (26, 3) [m] and (26, 4) that are all seen, known to `sigma_m`."""
     whole, nothing = np.ones(JOINT_COUNT, np.bool_), np.full((1, 3), np.nan)
+    cov = np.tile(sigma_m**2 * np.eye(3), (JOINT_COUNT, 1, 1))
+    source = np.full(JOINT_COUNT, Source.SOLVED, np.uint8)
     return HandPose(
-        hand=model.profile.name,
-        t_ns=t_ns,
-        position_m=place_m,
-        orientation_wxyz=turned_wxyz,
-        radius_m=model.radius_m,
-        valid=whole,
-        tracked=whole,
-        cov_m2=np.tile(sigma_m**2 * np.eye(3), (JOINT_COUNT, 1, 1)),
-        source=np.full(JOINT_COUNT, Source.SOLVED, np.uint8),
-        angles_rad=angles_rad,
-        markers_m=nothing,
-        markers_raw_m=nothing,
-        markers_cov_m2=np.full((1, 3, 3), np.nan),
-        inside_volume=whole,
-    )
+        model.profile.name, t_ns, place_m, turned_wxyz, model.radius_m, whole, whole, cov, source, angles_rad,
+        nothing, nothing, np.full((1, 3, 3), np.nan), whole,
+    )  # fmt: skip
 
 
 def recognised(poses: Sequence[HandPose], model: HandModel) -> list[str | None]:
@@ -135,21 +109,16 @@ def recognised(poses: Sequence[HandPose], model: HandModel) -> list[str | None]:
     return out
 
 
-PEOPLE = (20,)  # a minute or two each; more by the command line
+PERSON = 20
 _RATE_HZ, _SECONDS = 30.0, 15.0  # one round of the six poses
 _MOTION, _WRIST_PEOPLE = 100, 3
 _ROTATION_RAD = np.radians(0.75)  # per axis, the error of a calibrated mounting
 
 
-def rows(people: Sequence[int] = PEOPLE) -> Iterator[Row]:
-    """Measure a table of confusions for each rig, of these people together; a wrist device; recorded hands."""
-    every: dict[str, RecognisedPoses] = {}
-    for number in people:
-        for rig, one in (*_by_markers(number).items(), *_by_both(number).items()):
-            every.setdefault(rig, RecognisedPoses()).join(one)
-    for rig, one in every.items():
-        goal = "no goal: fingers hide" if rig == "desk" else "goal 98"
-        yield from one.rows(f"{rig}, people: {len(people)}", goal)
+def rows() -> Iterator[Row]:
+    """Measure a table of confusions for each rig, of one person; a wrist device; recorded hands."""
+    for rig, one in (_by_markers(PERSON) | _by_both(PERSON)).items():
+        yield from one.rows(f"{rig}, one person", "no goal: fingers hide" if rig == "desk" else "goal 98")
     yield from _worn().rows(f"wrist device, {_WRIST_PEOPLE} people")
     yield from _leap_rows()
 
@@ -235,9 +204,8 @@ def _leap_rows() -> Iterator[Row]:
     wrong, count, seconds = 0, 0, 0.0
     for seed, recorded in enumerate(recordings(folder)):
         found = recognised(_poses_of(recorded, recorded.model(), seed), recorded.model())
-        begun = [
-            k for k in range(len(found)) if found[k] is not None and (k == 0 or found[k] != found[k - 1])
-        ]
+        before = [None, *found]
+        begun = [k for k, name in enumerate(found) if name is not None and name != before[k]]
         wrong += sum(not agrees(str(found[k]), recorded.fingers_m[k]) for k in begun)
         count, seconds = count + len(begun), seconds + 1e-9 * float(recorded.t_ns[-1])
     yield Row("leapjs: wrong poses recognised", float(wrong), "", f"goal 0; of {count} in {seconds:.0f} s")
@@ -275,10 +243,3 @@ def agrees(name: str, fingers_m: Float) -> bool:
     }
     assert set(rules) == set(POSES)
     return bool(rules[name])
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Print the rows of some people."""
-    parser = argparse.ArgumentParser(prog="python -m bench gesture_poses", description=__doc__)
-    parser.add_argument("--people", nargs="+", type=int, default=list(PEOPLE), metavar="N")
-    show(rows(parser.parse_args(arguments).people))

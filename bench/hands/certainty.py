@@ -1,7 +1,7 @@
 """Do the covariances of joints hold? Exact motions, markers with the claimed noise, fingers hidden, hands lost.
 
-A joint counts as *visible* while its finger's marker is seen (those of the palm: while three markers are), as *hidden*
-for the first 300 ms without, as *lost* after half a second; a hand as *gone* while no marker is seen and it is valid.
+A joint is *visible* while its finger's marker is seen (of the palm: while three markers are), *hidden* for the first
+300 ms without, *lost* after half a second; a hand is *gone* while no marker is seen and it is valid.
 """
 
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.hands.draws import BACK, EDGE_ON, MARKERS, TOWARDS, PointHand
 from bench.played import HeldPoses, solve, times_of, times_of_poses, watch
-from bench.report import CALIBRATION, Row, datasets, inside, rms, skipped
+from bench.report import CALIBRATION, Row, chi_squares, datasets, inside, joined, rms, skipped
 from common.arrays import Bool, Float
 from common.calibration import Couplings, HandProfile, load
 from common.hand.model import CHAINS, TIPS, HandModel
@@ -69,11 +69,6 @@ class Coverage:
         return inside(self.chi_2)
 
 
-def joined(parts: list[Coverage]) -> Coverage:
-    """Several runs as one."""
-    return Coverage(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Coverage)))
-
-
 def motions(profile: HandProfile, seed: int) -> Iterator[tuple[str, HandModel, HandMotion]]:
     """The motions of a seed by name, and whose they are; those of recordings where they are present."""
     model = HandModel.of(profile)
@@ -98,11 +93,9 @@ def seen_by(seed: int, times_s: Float) -> Bool:
     for start in np.arange(0.5, times_s[-1], cycle_s):
         for after_s, lasts_s, count in ((0.0, 0.4, 3), (0.9, 1.2, 3), (2.7, 0.5, 0)):
             begin = start + after_s + rng.uniform(0.0, 0.4)
-            hidden = (
-                rng.choice(5, int(rng.integers(1, count + 1)), replace=False)
-                if count
-                else np.arange(len(MARKERS))
-            )
+            hidden = np.arange(len(MARKERS))
+            if count:
+                hidden = rng.choice(5, int(rng.integers(1, count + 1)), replace=False)
             now = np.flatnonzero((times_s >= begin) & (times_s < begin + lasts_s))
             seen[np.ix_(now, hidden)] = False
     return seen
@@ -162,7 +155,7 @@ def _judged(off_m: Float, cov_m2: Float, since_s: Float, gone: bool) -> Coverage
         hidden[:] = since_s.min()
     off, claimed = off_m[1:], cov_m2[1:]
     return Coverage(
-        np.vecdot(off, np.linalg.solve(claimed, off[..., None])[..., 0]),
+        chi_squares(off, claimed),
         np.linalg.norm(off, axis=1),
         np.sqrt(np.trace(claimed, axis1=1, axis2=2) / 3.0),
         hidden[1:],
@@ -176,14 +169,12 @@ def kinds(found: Coverage) -> Iterator[tuple[str, Coverage]]:
     here, step = found.gone == 0.0, 0.5 / _RATE_HZ
     palm, visible = np.isin(found.joint, _PALM_JOINTS), found.hidden_s == 0.0
     yield "visible", found.only(here & visible)
-    yield "  of these the palm's", found.only(here & visible & palm)
     yield "  of these the fingers'", found.only(here & visible & ~palm)
     short_s, long_s = 0.3, 0.5
     yield "hidden up to 300 ms", found.only(here & ~visible & (found.hidden_s <= short_s + step))
     yield "hidden for 300 ms", found.only(here & (np.abs(found.hidden_s - short_s) < step))
     yield "lost for longer than 0.5 s", found.only(here & (found.hidden_s > long_s + step))
     yield "whole hand gone, up to 0.5 s", found.only(~here)
-    yield "  for 300 ms", found.only(~here & (np.abs(found.hidden_s - short_s) < step))
 
 
 def rows() -> Iterator[Row]:
@@ -192,10 +183,8 @@ def rows() -> Iterator[Row]:
     everything: list[Coverage] = []
     for noise, sigma_m in NOISE_M.items():
         for played in zip(*(motions(profile, seed) for seed in SEEDS), strict=True):
-            parts = [
-                compared(model, motion, sigma_m, seed)
-                for (_, model, motion), seed in zip(played, SEEDS, strict=True)
-            ]
+            given = zip(played, SEEDS, strict=True)
+            parts = [compared(model, motion, sigma_m, seed) for (_, model, motion), seed in given]
             yield from _group(f"{played[0][0]}, {noise}", parts)
             everything += parts
     if not leap_recordings():
@@ -209,12 +198,7 @@ def _group(title: str, parts: list[Coverage]) -> Iterator[Row]:
     yield Row(title, len(parts), "runs", "")
     for name, part in kinds(joined(parts)):
         if len(part.chi_2):
-            yield _row(f"  {name}", part)
-
-
-def _row(name: str, part: Coverage) -> Row:
-    q50, q95 = np.quantile(part.chi_2, [0.5, 0.95])
-    found, claimed = rms(1e3 * part.error_m), np.sqrt(3.0) * rms(1e3 * part.sigma_m)
-    chi2 = f"chi square median {q50:.2g} (2.4), 95 % {q95:.3g} (7.8)"
-    note = f"{chi2}; error RMS {found:.1f} mm, claimed {claimed:.1f}"
-    return Row(f"{name}: inside 95 %", part.inside, "%", note)
+            error, claimed = rms(1e3 * part.error_m), np.sqrt(3.0) * rms(1e3 * part.sigma_m)
+            yield Row(
+                f"  {name}: inside 95 %", part.inside, "%", f"RMS {error:.1f} mm, claimed {claimed:.1f}"
+            )

@@ -24,7 +24,7 @@ from msgspec.structs import replace
 
 from bench.hands.draws import EDGE_ON, MARKERS, PointHand
 from bench.hands.motion import SIGMA_M, pip_deg
-from bench.report import Row, datasets, inside, rms
+from bench.report import Row, chi_squares, datasets, inside, joined, rms
 from common.arrays import Bool, Float, Int
 from common.calibration import HandProfile, MarkerMount
 from common.geometry.transforms import fit_rigid
@@ -84,15 +84,15 @@ def glove() -> tuple[Int, Float] | None:
 
 
 def _grasp_rows(motions: list[Grasped], backs: int, half: bool) -> Iterator[Row]:
-    pip, sigma, joint, chi2, tracked = (
-        np.concatenate([getattr(motion, name) for motion in motions])
-        for name in ("pip_deg", "sigma_deg", "joint_m", "chi2", "tracked")
-    )
+    every = joined(motions)
+    pip, sigma, tracked = every.pip_deg, every.sigma_deg, every.tracked
     who = f"grasping, {backs} on the back, hand of {'the first half' if half else 'the same motion'}"
     off = np.abs(pip)
     wrong = 100.0 * (off > 20.0)[tracked].mean()
-    yield Row(f"{who}: PIP", float(off.mean()), "deg", f"goal 8.5; joints {1e3 * joint.mean():.1f} mm")
-    yield Row(f"{who}: PIP joint in its 95 % region", inside(chi2[:, 1:, 1]), "%", "goal 90")
+    yield Row(
+        f"{who}: PIP", float(off.mean()), "deg", f"goal 8.5; joints {1e3 * every.joint_m.mean():.1f} mm"
+    )
+    yield Row(f"{who}: PIP joint in its 95 % region", inside(every.chi2[:, 1:, 1]), "%", "goal 90")
     note = f"goal 2; {100 * tracked.mean():.0f} % TRACKED"
     yield Row(f"{who}: TRACKED fingers 20 degrees off", float(wrong), "%", note)
     bins = [(sigma >= low) & (sigma < high) for low, high in pairwise(BINS_DEG)]
@@ -132,8 +132,7 @@ def grasped(path: Path, backs: int, half: bool) -> Grasped:
         variance: Float = hand.solution.measurement_cov.diagonal()[column]
         sigma.append(np.degrees(np.sqrt(variance)))
         joint.append(np.linalg.norm(off, axis=2).ravel())
-        inverse = np.linalg.inv(hand.solution.cov_m2[CHAINS] + 1e-12 * np.eye(3))
-        chi2.append(np.einsum("fki,fkij,fkj->fk", off, inverse, off))
+        chi2.append(chi_squares(off, hand.solution.cov_m2[CHAINS] + 1e-12 * np.eye(3)))
         tracked.append(np.asarray(hand.tracked[TIPS[1:]], np.bool_))
     return Grasped(np.array(pip), np.array(sigma), np.array(joint), np.array(chi2), np.array(tracked))
 
@@ -219,8 +218,7 @@ def hidden_tip(t_ns: Int, points_m: Float, finger: int, hidden_s: float) -> tupl
         if hand is None:
             continue
         error: Float = model.marker_points(hand.joints, MARKERS)[:5] - truth[k, :5]
-        region = hand.cov_m2[TIPS] + 1e-12 * np.eye(3)
-        each: Float = np.vecdot(error, np.linalg.solve(region, error[..., None])[..., 0])
+        each = chi_squares(error, hand.cov_m2[TIPS] + 1e-12 * np.eye(3))
         seen.append(each[np.isfinite(now[:5, 0])])
         if hidden[k] and np.isfinite(each[finger]):
             off.append(float(np.linalg.norm(error[finger])))

@@ -10,21 +10,8 @@ from functools import partial
 
 import numpy as np
 
-from bench.hands.draws import (
-    MARKERS,
-    Angles,
-    Draw,
-    Fingers,
-    PaperFingers,
-    Score,
-    bench_model,
-    closed_form,
-    draw,
-    finger_solvers,
-    scipy_finger,
-    score,
-    tips_in_palm,
-)
+from bench.hands import draws
+from bench.hands.draws import MARKERS, Angles, Draw, Fingers, Score
 from bench.report import Row, rms
 from common.hand.model import HandModel
 from master.fabrik.fabrik import Fabrik
@@ -32,15 +19,15 @@ from master.fabrik.linear_algebra import Vector
 from master.fabrik.solver import Finger
 
 CLOSED, WARM_STARTED, PAPER = "closed form", "FABRIK, seeded", "papers' way"
-_FROM_REST, _RESTARTED = "FABRIK, from rest", "FABRIK, from rest, restarts"
-_SLOW = {PAPER: 10, _FROM_REST: 10, _RESTARTED: 20, "scipy": 40}  # one hand in so many
+_FROM_REST = "FABRIK, from rest"
+_SLOW = {PAPER: 10, _FROM_REST: 10, "scipy": 40}  # one hand in so many
 _STRICT_MM = {CLOSED: 1e-3, WARM_STARTED: 0.1}  # by how much these two may miss
 
 
 def rows(hands: int = 2000) -> list[Row]:
     """Return time per hand of five fingers, targets missed, limits passed and error of the PIP of each way."""
-    model = bench_model()
-    truth = draw(model, 2, hands, coupling_off_rad=0.0)
+    model = draws.bench_model()
+    truth = draws.draw(model, 2, hands, coupling_off_rad=0.0)
     out: list[Row] = []
     for name, way in ways(model).items():
         found, us = timed(model, way, truth.every(_SLOW.get(name, 1)))
@@ -56,14 +43,13 @@ def rows(hands: int = 2000) -> list[Row]:
 
 def ways(model: HandModel) -> dict[str, Fingers]:
     """Return every solver by name; each begins afresh."""
-    fingers = finger_solvers(model)
+    fingers = draws.finger_solvers(model)
     return {
-        CLOSED: partial(closed_form, fingers),
+        CLOSED: partial(draws.closed_form, fingers),
         WARM_STARTED: _seeded(model),
-        _RESTARTED: _from_rest(fingers, 3),
-        _FROM_REST: _from_rest(fingers, 0),
-        PAPER: PaperFingers(fingers).push,
-        "scipy": lambda tips: [scipy_finger(one, tip) for one, tip in zip(fingers, tips, strict=True)],
+        _FROM_REST: _from_rest(fingers),
+        PAPER: draws.PaperFingers(fingers).push,
+        "scipy": lambda tips: [draws.scipy_finger(one, tip) for one, tip in zip(fingers, tips, strict=True)],
     }
 
 
@@ -79,8 +65,8 @@ def _seeded(model: HandModel) -> Fingers:
     return way
 
 
-def _from_rest(fingers: Sequence[Finger], restarts: int) -> Fingers:
-    prepared = [Fabrik.of(solver.chain, restarts=restarts) for solver in fingers]
+def _from_rest(fingers: Sequence[Finger]) -> Fingers:
+    prepared = [Fabrik.of(solver.chain, restarts=0) for solver in fingers]
 
     def way(tips: Sequence[Vector]) -> Angles:
         found = [f.solve(tip, None, one.root) for f, one, tip in zip(prepared, fingers, tips, strict=True)]
@@ -91,7 +77,7 @@ def _from_rest(fingers: Sequence[Finger], restarts: int) -> Fingers:
 
 def timed(model: HandModel, way: Fingers, truth: Draw) -> tuple[Score, float]:
     """Return the errors of a way, and its median processor time per hand, of ten parts [us]."""
-    targets = [tips_in_palm(T, caps) for T, caps in zip(truth.T_rig_palm, truth.caps_m, strict=True)]
+    targets = [draws.tips_in_palm(T, caps) for T, caps in zip(truth.T_rig_palm, truth.caps_m, strict=True)]
     found: list[Angles] = []
     times: list[float] = []
     parts = 10
@@ -100,4 +86,5 @@ def timed(model: HandModel, way: Fingers, truth: Draw) -> tuple[Score, float]:
         start = time.thread_time()
         found += [way(tips) for tips in targets[k : k + size]]
         times.append(1e6 * (time.thread_time() - start) / len(targets[k : k + size]))
-    return score(model, truth, truth.T_rig_palm, np.array(found), truth.caps_m), float(np.median(times))
+    found_score = draws.score(model, truth, truth.T_rig_palm, np.array(found), truth.caps_m)
+    return found_score, float(np.median(times))

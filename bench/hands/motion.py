@@ -1,10 +1,9 @@
 """Hands that others recorded, as the truth, through solver and filter; and held hands.
 
-**Motion**: the joints that the Leap recorded (`leapjs/*.npz`, model-based: bones are constant, the DIP bends as the
-PIP) are the truth. A profile is made from the same joints (`common.hand.fitting`), its DIP coupled 1 : 1, its limits D,
-widened (`wide_limits`). Caps on the five tips and one on the back, 1 mm of noise, go through estimator and filter at
-the recorded times. The cameras see the back of the hand in the mean; the cap there is hidden beyond 75 degrees. Wrist
-and metacarpals were not recorded; the error is the mean over the 20 recorded joints.
+**Motion**: the joints that the Leap recorded (`leapjs/*.npz`) are the truth. A profile is made from the same joints
+(`common.hand.fitting`), its DIP coupled 1 : 1, its limits wide. Caps on the five tips and one on the back, 1 mm of
+noise, go through estimator and filter; the one on the back is hidden beyond 75 degrees. Errors are of the 20 recorded
+joints.
 
 **Held**: generated hands, 1 mm of noise, 60 frames a second; what is left after the filter, over time.
 """
@@ -139,17 +138,22 @@ def play(recorded: Recorded, model: HandModel, seed: int) -> Score:
 
 def floor_m(recorded: Recorded, model: HandModel) -> Float:
     """Return how far the profile's joints are from the recorded ones at best (N, 20) [m]: palm known, angles free."""
-    out: list[Float] = []
-    start = np.zeros(20)
     fixed = 40  # frames per recording in which the profile is judged without noise
-    for fingers in recorded.fingers_m[:: max(1, len(recorded.fingers_m) // fixed)]:
+    fingers = recorded.fingers_m[:: max(1, len(recorded.fingers_m) // fixed)]
+    found = model.chains(nearest(model, fingers).reshape(-1, 5, 4)).position_m
+    return np.linalg.norm(found - fingers, axis=3).reshape(-1, 20)
+
+
+def nearest(model: HandModel, fingers_m: Float, tolerance: float = 1e-8) -> Float:
+    """Return the angles (N, 20) [rad] of a model that come nearest to joints (N, 5, 4, 3) [m], palm frame."""
+    out = [np.zeros(20)]
+    for fingers in fingers_m:
 
         def off(x: Float, fingers: Float = fingers) -> Float:
             return (1e3 * (model.chains(x.reshape(5, 4)).position_m - fingers)).ravel()
 
-        start = np.asarray(least_squares(off, start).x, np.float64)
-        out.append(1e-3 * np.linalg.norm(off(start).reshape(20, 3), axis=1))
-    return np.array(out)
+        out.append(np.asarray(least_squares(off, out[-1], xtol=tolerance, ftol=tolerance).x, np.float64))
+    return np.array(out[1:])
 
 
 def track(
@@ -158,8 +162,7 @@ def track(
     """Return solved and filtered hands of caps (T, 6, 3) with 1 mm of noise."""
     solver = PointHand(model, MARKERS)
     smooth = HandOneEuro(model, MARKERS, OneEuroParameters.of(FilterCalibration()))
-    solved: list[FittedHand] = []
-    shown: list[FittedHand] = []
+    solved, shown = list[FittedHand](), list[FittedHand]()
     for t, seen in zip(t_ns.tolist(), points, strict=True):
         cov = np.where(np.isfinite(seen[:, :1, None]), SIGMA_M**2 * np.eye(3), np.nan)
         hand = solver.push(t, seen, cov, towards)
@@ -179,8 +182,7 @@ def pip_deg(places: Float) -> Float:
 
 
 def _motion_rows(folder: Path) -> Iterator[Row]:
-    every: list[Score] = []
-    floors: list[Float] = []
+    every, floors = list[Score](), list[Float]()
     for recorded in recordings(folder):
         model = recorded.model()
         score = play(recorded, model, seed=len(every))
@@ -238,9 +240,8 @@ def _held_rows() -> Iterator[Row]:
         noise = [np.random.default_rng(s).normal(0.0, SIGMA_M, (frames, 6, 3)) for s in range(seeds)]
         runs = [track(model, t_ns, caps + one) for one in noise]
         before, after = (np.array([jitter(run[k][settled:]) for run in runs]) for k in (0, 1))
-        for k, (what, unit, goal) in enumerate(
-            (("joints", "mm", 0.5), ("angles", "deg", 1.0), ("orientations", "deg", 1.0))
-        ):
+        parts = (("joints", "mm", 0.5), ("angles", "deg", 1.0), ("orientations", "deg", 1.0))
+        for k, (what, unit, goal) in enumerate(parts):
             worst, raw = after[:, k].max(), before[:, k].mean()
             note = f"goal {goal}; worst of {seeds} seeds {worst:.2f}, before the filter {raw:.2f}"
             yield Row(f"held, {name}: jitter of {what}", float(after[:, k].mean()), unit, note)

@@ -15,23 +15,8 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from bench.hands.draws import (
-    FACING_ROTATION,
-    MARKERS,
-    Fingers,
-    Noise,
-    PaperFingers,
-    PointHand,
-    Score,
-    bench_model,
-    closed_form,
-    draw,
-    finger_solvers,
-    fixed_palm,
-    score,
-    seen,
-    tips_in_palm,
-)
+from bench.hands import draws
+from bench.hands.draws import FACING_ROTATION, MARKERS, Fingers, Noise, Score
 from bench.report import Row, show
 from common.arrays import Float
 from common.hand.model import HandModel
@@ -65,9 +50,8 @@ def rows(poses: int = POSES) -> list[Row]:
         results = list(workers.map(partial(_batch, count=max(1, poses // BATCHES)), jobs))
     out: list[Row] = []
     for name, scenario in SCENARIOS.items():
-        out += scenario_rows(
-            name, scenario, [r for (of, _), r in zip(jobs, results, strict=True) if of == name]
-        )
+        own = [r for (of, _), r in zip(jobs, results, strict=True) if of == name]
+        out += scenario_rows(name, scenario, own)
     return out
 
 
@@ -77,22 +61,22 @@ def _batch(job: tuple[str, int], count: int) -> dict[str, Score]:
 
 def batch(noise: Noise, seed: int, count: int) -> dict[str, Score]:
     """Solve `count` poses of one seed in every way: name of the way -> its errors."""
-    model = bench_model()
-    truth = draw(model, seed, count)
-    points, rotation = seen(truth, noise, seed)
+    model = draws.bench_model()
+    truth = draws.draw(model, seed, count)
+    points, rotation = draws.seen(truth, noise, seed)
     # The papers' palm faces the cameras; where an orientation is known, their fingers get it too.
     facing = np.tile(FACING_ROTATION, (count, 1, 1)) if rotation is None else rotation
-    palms = np.array([fixed_palm(model, p, R) for p, R in zip(points, facing, strict=True)])
-    tips = [tips_in_palm(T, p) for T, p in zip(palms, points, strict=True)]
-    fingers = finger_solvers(model)
+    palms = np.array([draws.fixed_palm(model, p, R) for p, R in zip(points, facing, strict=True)])
+    tips = [draws.tips_in_palm(T, p) for T, p in zip(palms, points, strict=True)]
+    fingers = draws.finger_solvers(model)
 
     def alone(solve: Fingers) -> Score:
-        return score(model, truth, palms, np.array([solve(p) for p in tips]), points)
+        return draws.score(model, truth, palms, np.array([solve(p) for p in tips]), points)
 
     return {
-        WHOLE: score(model, truth, *_whole_hands(model, points, noise, rotation), points),
-        PAPER: alone(PaperFingers(fingers).push),
-        CLOSED: alone(partial(closed_form, fingers)),
+        WHOLE: draws.score(model, truth, *_whole_hands(model, points, noise, rotation), points),
+        PAPER: alone(draws.PaperFingers(fingers).push),
+        CLOSED: alone(partial(draws.closed_form, fingers)),
     }
 
 
@@ -100,7 +84,7 @@ def _whole_hands(
     model: HandModel, points_m: Float, noise: Noise, rotation: Float | None
 ) -> tuple[Float, Float]:
     """Palms (N, 4, 4) and angles (N, 5, 4) [rad] of the whole-hand fit, each afresh; NaN where it finds none."""
-    solver = PointHand(model, MARKERS, continuous=False, faces=False)
+    solver = draws.PointHand(model, MARKERS, continuous=False, faces=False)
     palms, angles = np.full((len(points_m), 4, 4), np.nan), np.full((len(points_m), 5, 4), np.nan)
     for k, p in enumerate(points_m):
         measured = None
@@ -125,12 +109,7 @@ def scenario_rows(name: str, scenario: Scenario, batches: Sequence[dict[str, Sco
         out += [
             _errors(f"{name}: PIP, {way}", [s.pip_deg for s in found], "deg", pip),
             _errors(f"{name}: joints, {way}", [s.joints_mm for s in found], "mm", joints),
-            Row(
-                f"{name}: limit violations, {way}",
-                float(bad),
-                "angles",
-                f"{none}; {missed:.1f} % of tips missed",
-            ),
+            Row(f"{name}: limit violations, {way}", bad, "angles", f"{none}; {missed:.1f} % of tips missed"),
         ]
     return out
 

@@ -1,10 +1,9 @@
 """One painted cap as a camera forms it: drawn in linear light, averaged over pixel area and exposure, truth exact.
 
-Everything is drawn on a fine grid in linear light and box-averaged over pixels and exposure. A cap is an ellipse of
-paint on skin (a finger that goes on to one side, or a round patch). In the frame of its unit circle, x = centre + A q
-with |q| <= 1, it is shaded like a sphere segment (Lambert), has a white highlight, and may lose the segment {q . n > h}
-to an edge in front of it. The centroid of the rest is known in closed form: a segment of half angle t = acos(h) has
-area t - h sin t and its centroid at 2/3 sin^3 t / area.
+A cap is an ellipse of paint on skin (a finger that goes on to one side, or a round patch), drawn on a fine grid and
+box-averaged. In the frame of its unit circle it is shaded like a sphere segment (Lambert), has a white highlight, and
+may lose the segment {q . n > h} to an edge in front of it. The centroid of the rest is known in closed form: a segment
+of half angle t = acos(h) has area t - h sin t and its centroid at 2/3 sin^3 t / area.
 """
 
 import math
@@ -171,14 +170,14 @@ def _exposed(
     """Premultiplied light and coverage (H, W, 4) of the box, averaged over exposure and pixels."""
     left, top, width, height = box
     way = math.hypot(*motion)
-    step = 0.25  # px of motion between two drawn instants of the exposure
+    step = 0.25  # px of motion between two drawn moments of the exposure
     steps = 1 if way == 0.0 else math.ceil(way / step)
     pad = math.ceil(0.5 * max(abs(motion[0]), abs(motion[1]))) + 1 if steps > 1 else 0
     x = (np.arange(-pad * fine, (width + pad) * fine) + 0.5) / fine - 0.5 + left - cap.u
     y = (np.arange(-pad * fine, (height + pad) * fine) + 0.5) / fine - 0.5 + top - cap.v
     canvas = _paint(cap, x.astype(np.float32)[None, :], y.astype(np.float32)[:, None], to_light, fine)
     if steps > 1:
-        # Instants symmetric about the middle, rounded symmetrically: their mean place is exactly the cap's.
+        # Moments symmetric about the middle, rounded symmetrically: their mean place is exactly the cap's.
         epochs = (np.arange(steps) + 0.5) / steps - 0.5
         mean = np.zeros((height * fine, width * fine, 4), np.float32)
         for dx, dy in np.rint(fine * epochs[:, None] * np.array(motion)).astype(int).tolist():

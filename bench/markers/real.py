@@ -18,7 +18,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from bench.markers.scene import KINDS, Kind, expose, make_scene
+from bench.markers.scene import KINDS, Kind, camera_of, expose, make_scene
 from bench.report import CALIBRATION, ROOT, Row, datasets, skipped
 from common.arrays import Bool, Float, Image
 from common.calibration import CameraCalibration, HsvRange, load
@@ -82,12 +82,10 @@ def painted(photo: Photo, rng: np.random.Generator) -> Painted:
     shown: list[int] = rng.permutation(len(scene.caps))[: rng.integers(1, len(scene.caps) + 1)].tolist()
     covered = 0.3  # share of the caps that something covers,
     hidden = 0.4  # and of such a cap, at most
-    caps = [
-        replace(cap, occluder=replace(occluder, share=rng.uniform(0.1, hidden)))
-        if rng.random() < covered
-        else cap
-        for cap, occluder in zip(scene.caps, scene.occluders, strict=True)
-    ]
+    caps = list(scene.caps)
+    for m, occluder in enumerate(scene.occluders):
+        if rng.random() < covered:
+            caps[m] = replace(caps[m], occluder=replace(occluder, share=rng.uniform(0.1, hidden)))
     light = replace(scene, table=table).light(tuple(caps[m] for m in shown))
     image = expose(light, kind.noise, rng)
     uv = np.full((len(caps), 2), np.nan)
@@ -120,9 +118,8 @@ def halves(image: Image) -> Iterator[Image]:
     for v in (0, height // 3):
         for u in (0, width // 3):
             part = image[v : v + 2 * height // 3, u : u + 2 * width // 3]
-            yield np.ascontiguousarray(
-                cv2.resize(part, (width, height), interpolation=cv2.INTER_CUBIC), np.uint8
-            )
+            large = cv2.resize(part, (width, height), interpolation=cv2.INTER_CUBIC)
+            yield np.ascontiguousarray(large, np.uint8)
 
 
 SIX: Final = ("thumb", "index", "middle", "ring", "little", "back")
@@ -193,13 +190,8 @@ class Collector:
             view = painted(photo, rng)
             image = as_by_another_camera(view.image, rng)
             of_kind = view.kind.camera.markers or {}
-            self.look(
-                f"painted {photo.source}",
-                image,
-                {n: of_kind[n] for n in view.kind.names},
-                view.uv,
-                view.radius,
-            )
+            named = {n: of_kind[n] for n in view.kind.names}
+            self.look(f"painted {photo.source}", image, named, view.uv, view.radius)
 
     def look_at_rendered(self, rng: np.random.Generator) -> None:
         """Look at rendered hands, as they are and by other cameras, with colours of one picture."""
@@ -298,18 +290,7 @@ def shipped() -> dict[str, HsvRange]:
 
 def camera_for(image: Image, ranges: Mapping[str, HsvRange]) -> CameraCalibration:
     """A camera of the size of a picture."""
-    return CameraCalibration(
-        version=1,
-        name="photo",
-        width_px=image.shape[1],
-        height_px=image.shape[0],
-        frame_rate_hz=30.0,
-        exposure_us=5000.0,
-        analogue_gain=1.0,
-        colour_gains=(1.0, 1.0),
-        row_time_us=20.0,
-        markers=dict(ranges),
-    )
+    return camera_of("photo", (image.shape[1], image.shape[0]), dict(ranges), 30.0)
 
 
 def ball() -> tuple[dict[str, tuple[float, float, float]], dict[str, Image]]:
@@ -341,7 +322,7 @@ def clicked_ranges(
             try:
                 grow(hsv, "ball", click)
             except FitError:
-                continue  # as a person would be told to click again
+                continue  # a person would click again
             found.append(calibrate(images[name], {"ball": click})[0].range)
     return found
 
@@ -374,11 +355,11 @@ def rows() -> Iterator[Row]:
     plain_photo = np.array([source.startswith("photo ") for source in seen.source])
     count = max(sum(seen.photos.values()), 1)
     likely = float((seen.quality[plain_photo] > _LIKELY).sum()) / count
-    yield Row(
-        "photographs: false markers", float(plain_photo.sum()) / count, "each", f"of {count} photographs"
-    )
+    every = float(plain_photo.sum()) / count
+    yield Row("photographs: false markers", every, "each", f"of {count} photographs")
     yield Row(f"the same, of quality above {_LIKELY}", likely, "each", "goal 0.2")
-    for stated, right, share in table_of(seen):
+    table = reliability(seen.quality, seen.right.astype(np.float64), weights_of(seen))
+    for stated, right, share in table:
         yield Row(f"quality {stated:.2f}: is a marker", right, "share", f"{100.0 * share:.0f} % of all found")
 
 
@@ -411,11 +392,6 @@ def looked_at(rng: np.random.Generator) -> Rows:
     collector.look_at_rendered(rng)
     collector.look_at_ball(rng, 2, other=False)
     return collector.rows()
-
-
-def table_of(seen: Rows) -> list[tuple[float, float, float]]:
-    """Return the reliability table: markers and other things count alike."""
-    return reliability(seen.quality, seen.right.astype(np.float64), weights_of(seen))
 
 
 def _plain(image: Image, colour: HsvRange) -> Float:

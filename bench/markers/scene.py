@@ -1,11 +1,8 @@
 """Frames with painted caps and exact truth, from fixed seeds, kind by kind: what detectors are measured on.
 
-HSV ranges follow the rule of a person who calibrates with care: hue half-way to the neighbours and to skin, saturation
-down to that of a half covered pixel, value down to the shadow side; fixed here, so that a change of the colour
-calibration does not move the scale. Scenes are drawn at random once: radii, aspect, shading, light, highlights, skin,
-table tops and lens blur are uniform and physical, none is fitted to a detector. A sequence is one scene for a few
-frames: the caps move a little from frame to frame, as a tracker needs it. Then a camera follows: shot and read noise,
-ten linear bits, sRGB bytes.
+HSV ranges are those of a person who calibrates with care, fixed here, so that no change of the colour calibration
+moves the scale. A sequence is one scene, drawn at random, for a few frames in which the caps move a little. Then a
+camera follows: shot and read noise, ten linear bits, sRGB bytes (docs/measuring.md).
 """
 
 import colorsys
@@ -50,21 +47,18 @@ def camera_file(count: int, size: tuple[int, int]) -> CameraCalibration:
     """The camera of `size` (width, height) [px] with the ranges of `count` markers."""
     named = paints(count)
     hsv = {name: _hsv(colour) for name, colour in named.items()}
+    others = {name: [h for other, (h, _, _) in hsv.items() if other != name] for name in hsv}
+    return camera_of(f"bench{count}", size, {name: _range(own, others[name]) for name, own in hsv.items()})
+
+
+def camera_of(
+    name: str, size: tuple[int, int], markers: dict[str, HsvRange], rate_hz: float = 60.0
+) -> CameraCalibration:
+    """A camera of `size` (width, height) [px] without a lens."""
     return CameraCalibration(
-        version=1,
-        name=f"bench{count}",
-        width_px=size[0],
-        height_px=size[1],
-        frame_rate_hz=60.0,
-        exposure_us=5000.0,
-        analogue_gain=1.0,
-        colour_gains=(1.0, 1.0),
-        row_time_us=20.0,
-        markers={
-            name: _range(own, [h for other, (h, _, _) in hsv.items() if other != name])
-            for name, own in hsv.items()
-        },
-    )
+        version=1, name=name, width_px=size[0], height_px=size[1], frame_rate_hz=rate_hz, exposure_us=5000.0,
+        analogue_gain=1.0, colour_gains=(1.0, 1.0), row_time_us=20.0, markers=markers,
+    )  # fmt: skip
 
 
 def _range(own: tuple[int, int, int], others: list[int]) -> HsvRange:
@@ -110,10 +104,10 @@ class Kind:
     def camera(self) -> CameraCalibration:
         """The camera file of these frames."""
         still = camera_file(self.count, self.size)
+        if not self.blur_px:
+            return still
         # Blurred caps move by the way of one frame: such a camera exposes from frame to frame.
-        return (
-            msgspec.structs.replace(still, exposure_us=1e6 / still.frame_rate_hz) if self.blur_px else still
-        )
+        return msgspec.structs.replace(still, exposure_us=1e6 / still.frame_rate_hz)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -200,28 +194,17 @@ def make_scene(kind: Kind, rng: np.random.Generator) -> Scene:
     colours = list(paints(kind.count).values())
     make = _finger_cap if kind.finger else _patch_cap
     caps = tuple(make(rng, *spot, colour) for spot, colour in zip(spots, colours, strict=True))
-    occluders = tuple(
-        Occluder(
-            rng.uniform(0.0, 2.0 * math.pi),
-            kind.hidden,
-            _times(SKIN_LINEAR_RGB, 0.8) if rng.random() < 0.5 else CARD_LINEAR_RGB,
-        )
-        for _ in caps
-    )
+    occluders: list[Occluder] = []
+    for _ in caps:
+        angle = rng.uniform(0.0, 2.0 * math.pi)
+        colour = _times(SKIN_LINEAR_RGB, 0.8) if rng.random() < 0.5 else CARD_LINEAR_RGB
+        occluders.append(Occluder(angle, kind.hidden, colour))
     table = _table(rng, kind.size)
     for _ in range(kind.objects):
         _lay_object(table, rng, caps, scale)
-    return Scene(
-        kind=kind,
-        caps=caps,
-        occluders=occluders,
-        table=table,
-        to_light=to_light,
-        brightness=rng.uniform(0.6, 1.2),
-        lens_px=rng.uniform(0.4, 0.7),
-        velocity=velocity,
-        wander_px=0.0 if kind.blur_px else 0.3 * scale,
-    )
+    brightness, lens_px = rng.uniform(0.6, 1.2), rng.uniform(0.4, 0.7)
+    wander_px = 0.0 if kind.blur_px else 0.3 * scale
+    return Scene(kind, caps, tuple(occluders), table, to_light, brightness, lens_px, velocity, wander_px)
 
 
 def _hand(
@@ -270,21 +253,10 @@ def _finger_cap(
     behind = max(0.0, half_width - a) + 0.1 * radius
     skin = _times(SKIN_LINEAR_RGB, rng.uniform(0.7, 1.0))
     away, t = math.sqrt(rng.random()), rng.uniform(0.0, 2.0 * math.pi)
-    return Cap(
-        u=u,
-        v=v,
-        a=a,
-        b=b,
-        angle=back,
-        marker_colour=marker_colour,
-        bulge=rng.uniform(0.5, 0.98),
-        support=Support(
-            (behind * math.cos(back), behind * math.sin(back)), back, 3.5 * radius, half_width, skin, True
-        ),
-        highlight=Highlight(
-            away * math.cos(t), away * math.sin(t), rng.uniform(0.0, 0.25), rng.uniform(0.4, 1.0)
-        ),
-    )
+    bulge, begins = rng.uniform(0.5, 0.98), (behind * math.cos(back), behind * math.sin(back))
+    finger = Support(begins, back, 3.5 * radius, half_width, skin, True)
+    spot = Highlight(away * math.cos(t), away * math.sin(t), rng.uniform(0.0, 0.25), rng.uniform(0.4, 1.0))
+    return Cap(u, v, a, b, back, marker_colour, bulge, finger, spot)
 
 
 def _patch_cap(
@@ -297,18 +269,9 @@ def _patch_cap(
     away = 0.0 if place == 0 else patch + radius * rng.uniform(-0.5, 0.5)
     t = back + math.radians(rng.uniform(-60.0, 60.0))
     skin = _times(SKIN_LINEAR_RGB, rng.uniform(0.7, 1.0))
-    return Cap(
-        u=u,
-        v=v,
-        a=radius / stretch,
-        b=radius * stretch,
-        angle=rng.uniform(0.0, math.pi),
-        marker_colour=marker_colour,
-        bulge=rng.uniform(0.3, 0.9),
-        support=None
-        if place == 2
-        else Support((away * math.cos(t), away * math.sin(t)), 0.0, 0.0, patch, skin, False),
-    )
+    under = Support((away * math.cos(t), away * math.sin(t)), 0.0, 0.0, patch, skin, False)
+    angle, bulge, on = rng.uniform(0.0, math.pi), rng.uniform(0.3, 0.9), None if place == 2 else under
+    return Cap(u, v, radius / stretch, radius * stretch, angle, marker_colour, bulge, on)
 
 
 def _table(rng: np.random.Generator, size: tuple[int, int]) -> Light:
@@ -417,17 +380,11 @@ def frame_of(
     scene: Scene, caps: tuple[Cap, ...], k: int, rng: np.random.Generator, *, judged: bool = True
 ) -> MarkerFrame:
     """The k-th frame of a scene, its caps as given, and the truth of the scene's own caps."""
-    seen = np.array([cap.visible for cap in caps])
-    return MarkerFrame(
-        image=expose(scene.light(caps), scene.kind.noise, rng),
-        t_ns=k * STEP_NS,
-        uv=seen[:, :2],
-        whole_uv=np.array([cap.whole for cap in caps]),
-        area=seen[:, 2],
-        visible=np.array([1.0 - c.occluder.share if c.occluder else 1.0 for c in caps]),
-        radius=np.array([math.sqrt(cap.a * cap.b) for cap in caps]),
-        judged=judged,
-    )
+    seen, whole = np.array([cap.visible for cap in caps]), np.array([cap.whole for cap in caps])
+    visible = np.array([1.0 - c.occluder.share if c.occluder else 1.0 for c in caps])
+    radius = np.array([math.sqrt(cap.a * cap.b) for cap in caps])
+    image = expose(scene.light(caps), scene.kind.noise, rng)
+    return MarkerFrame(image, k * STEP_NS, seen[:, :2], whole, seen[:, 2], visible, radius, judged)
 
 
 def variance(light: Light, noise: float) -> Light:

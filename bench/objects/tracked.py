@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.played import START_NS, message_of, times_of
+from bench.played import START_NS, observed, times_of
 from bench.report import CALIBRATION, Row, rig_files
 from common.arrays import Float
 from common.calibration import load
@@ -18,13 +18,10 @@ from common.calibration.object_profile import ObjectProfile
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import matrix_to_rotation_vector, quaternion_to_matrix
 from common.messages import MarkerDetections, ObjectPose, TagDetections
-from common.sim.render import Renderer
 from common.sim.scene import Scene
 from common.sim.scenes import scene_by_name
 from master.objects.line import ObjectLine
 from master.objects.surface import Features
-from slave.markers.reloadable import detector_for
-from slave.markers.white_balance import Inline
 from slave.tags.finder import TagFinder
 
 OBJECTS = {"wand": "beads", "cube": "tags"}
@@ -37,12 +34,11 @@ Seen = dict[str, list[tuple[int, Float]]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """One stretch: errors [mm], [deg] and squares of errors in sigmas of what was tracked; right flags and all."""
+    """One stretch: errors [mm], [deg] of what was tracked; right flags and all."""
 
     frames: int
     mm: Float
     deg: Float
-    sigmas_2: Float
     flagged: tuple[int, int]
     clear: tuple[int, int]
 
@@ -56,9 +52,7 @@ def rows() -> Iterable[Row]:
 
 
 def _rows_of(title: str, found: list[Outcome]) -> Iterable[Row]:
-    mm, deg, sigmas = (
-        np.concatenate([getattr(one, key) for one in found]) for key in ("mm", "deg", "sigmas_2")
-    )
+    mm, deg = (np.concatenate([getattr(one, key) for one in found]) for key in ("mm", "deg"))
     frames = sum(one.frames for one in found)
     for what, values, unit, goal in (("place", mm, "mm", 3), ("turn", deg, "deg", 2)):
         if len(values):  # a stretch in which it is never tracked has no error
@@ -67,9 +61,6 @@ def _rows_of(title: str, found: list[Outcome]) -> Iterable[Row]:
             yield Row(f"{title}: {what}, 95 % of frames", float(most), unit, note)
     within = 100.0 * float(((mm <= 3.0) & (deg <= 2.0)).sum()) / frames
     yield Row(f"{title}: tracked and within both", within, "%", f"of {frames} frames")
-    if len(sigmas):
-        middle = float(np.sqrt(np.median(sigmas)))
-        yield Row(f"{title}: error by stated sigma", middle, "", "median; goal 1")
     for what, pairs in (
         ("hidden and flagged", [one.flagged for one in found]),
         ("not hidden and flagged", [one.clear for one in found]),
@@ -98,18 +89,16 @@ def _monitored(
     rig, messages, seen = scene.rig, list[MarkerDetections | TagDetections](), Seen()
     for camera in rig.cameras:
         own = scene.cameras[camera]
-        renderer, seen[camera] = Renderer(scene, camera), []
-        detector = detector_for(own, rig.markers, Inline(), free=rig.free_markers)
+        seen[camera] = []
         finder = None if profile.tags is None else TagFinder(own, [profile])
         half_ns = round(0.5 * own.height_px * own.row_time_us * 1e3)
-        for seq, t in enumerate(times_of(scene, camera, seconds, own.frame_rate_hz, start_s).tolist()):
-            t_ns = START_NS + round(t * 1e9)
-            image, view = renderer.observe(t)
-            seen[camera].append((t_ns + half_ns, view.objects[profile.name].visible))
-            messages.append(message_of(camera, seq, t_ns, detector.push(image, t_ns)))
+        times = times_of(scene, camera, seconds, own.frame_rate_hz, start_s)
+        for message, view, image in observed(scene, camera, times):
+            seen[camera].append((message.t_ns + half_ns, view.objects[profile.name].visible))
+            messages.append(message)
             if finder is not None:
-                tags = finder.push(image, t_ns)
-                messages.append(TagDetections(camera, 1, seq, t_ns, t_ns, tags.ids, tags.uv, tags.sigma_px))
+                tags, of = finder.push(image, message.t_ns), (message.seq, message.t_ns, message.t_ns)
+                messages.append(TagDetections(camera, 1, *of, tags.ids, tags.uv, tags.sigma_px))
     return sorted(messages, key=lambda m: (m.t_ns, isinstance(m, TagDetections))), seen
 
 
@@ -121,7 +110,7 @@ def _judged(
     seen: Seen,
     name: str,
 ) -> Outcome:
-    mm, deg, sigmas = list[float](), list[float](), list[float]()
+    mm, deg = list[float](), list[float]()
     flags = {True: [0, 0], False: [0, 0]}
     for pose in poses:
         T = scene.truth((pose.t_ns - START_NS) * 1e-9).objects[name]
@@ -136,15 +125,12 @@ def _judged(
         if not pose.tracked:
             continue
         rotation = matrix_to_rotation_vector(T[:3, :3] @ quaternion_to_matrix(pose.orientation_wxyz).T)
-        off = np.concatenate([T[:3, 3] - pose.position_m, rotation])
-        mm.append(1e3 * float(np.linalg.norm(off[:3])))
+        mm.append(1e3 * float(np.linalg.norm(T[:3, 3] - pose.position_m)))
         deg.append(float(np.degrees(np.linalg.norm(rotation))))
-        sigmas.append(float(off @ np.linalg.solve(pose.cov, off)) / 6.0)
     (hidden, of_hidden), (clear, of_clear) = flags[True], flags[False]
-    arrays = (np.array(mm), np.array(deg), np.array(sigmas))
-    return Outcome(len(poses), *arrays, (hidden, of_hidden), (clear, of_clear))
+    return Outcome(len(poses), np.array(mm), np.array(deg), (hidden, of_hidden), (clear, of_clear))
 
 
 def _near(seen: list[tuple[int, Float]], t_ns: int) -> Float:
-    """Shares (F,) in the frame nearest to an instant."""
+    """Shares (F,) in the frame nearest to a moment."""
     return min(seen, key=lambda frame: abs(frame[0] - t_ns))[1]

@@ -107,28 +107,12 @@ def _messages(
     seen = np.isfinite(places[:, 0])
     away = np.linalg.norm(where(t_s)[:3, 3] - model.centre)
     area = np.pi * (np.array([*features.radius_m[:beads], 0.01])[0] * model.matrix[0, 0] / away) ** 2
-    yield MarkerDetections(
-        camera=name,
-        session=1,
-        seq=seq,
-        t_ns=t_ns,
-        ready_t_ns=ready_ns,
-        uv=places,
-        area=np.where(seen, area, np.nan),
-        quality=np.where(seen, 1.0, 0.0),
-        sigma_px=np.where(seen, sigma_px, np.nan),
-        alt_uv=np.full((m, 2), np.nan),
-    )
+    area, sigma = np.where(seen, area, np.nan), np.where(seen, sigma_px, np.nan)
+    frame = (name, 1, seq, t_ns, ready_ns)
+    yield MarkerDetections(*frame, places, area, np.where(seen, 1.0, 0.0), sigma, np.full((m, 2), np.nan))
     if not features.tag_ids:
         return
     found = sorted((features.tag_ids[k], k) for k in range(len(features.tag_ids)) if shown[beads + k])
-    yield TagDetections(
-        camera=name,
-        session=1,
-        seq=seq,
-        t_ns=t_ns,
-        ready_t_ns=ready_ns,
-        ids=np.array([number for number, _ in found], np.uint16),
-        uv=np.array([uv[features.corners_of(k)] for _, k in found]).reshape(-1, 4, 2),
-        sigma_px=np.full(len(found), sigma_px),
-    )
+    ids = np.array([number for number, _ in found], np.uint16)
+    corners = np.array([uv[features.corners_of(k)] for _, k in found]).reshape(-1, 4, 2)
+    yield TagDetections(*frame, ids, corners, np.full(len(found), sigma_px))

@@ -3,7 +3,7 @@
     python -m bench oracle freeze                     once: recordings and truth, into out/oracle
     python -m bench oracle run --name base            the hands that this code makes of them
     python -m bench oracle run --name new --sets held,room --solver fabrik
-    python -m bench oracle compare base new           errors, certainty, jitter, lag, cost; old, new, ratio; verdicts
+    python -m bench oracle compare base new           errors, coverage, jitter, lag, cost; old, new, ratio; verdicts
     python -m bench oracle compare base new --tree DIR     makes both first: `base` by the code in DIR, `new` by this,
                                                       in turns, so that both meet the same minutes of the machine
 
@@ -32,7 +32,7 @@ Maker = Callable[[], Iterable[Piece]]
 
 @dataclass(frozen=True, slots=True)
 class Runner:
-    """Who makes a run: the code of which checkout, under which name, with which solver (None: as the rigs say)."""
+    """Who makes a run: the code of which checkout, under which name, with which solver (None: of the rigs)."""
 
     tree: Path
     name: str

@@ -25,7 +25,7 @@ class Solved:
     """The poses of one run of one set, T of all its recordings one after another."""
 
     piece: npt.NDArray[np.str_]  # (T,) name of the recording
-    t_ns: Int  # (T,) instants
+    t_ns: Int  # (T,) moments
     position_m: Float  # (T, 26, 3), angles_rad: (T, 5, 4), cov_m2: (T, 26, 3, 3), valid, tracked: (T, 26)
     angles_rad: Float
     cov_m2: Float
@@ -80,7 +80,7 @@ class Samples:
     rest_mm: Float = field(default_factory=_nothing)  # (R,) a joint's step while the truth rests
     spent_us: Float = field(default_factory=_nothing)  # (T,) processor time of each pose
     lag_m2: Float = field(default_factory=lambda: np.zeros(len(LAGS_NS)))
-    wanted: int = 0  # how many joints there are in truth, at all instants
+    wanted: int = 0  # how many joints there are in truth, at all moments
     epochs: int = 0  # with a hand in truth
     without: int = 0  # of them without one in the run
     ghosts: int = 0  # with a hand in the run alone
@@ -94,7 +94,7 @@ class Samples:
 
 
 def samples_of(run: Solved, truths: Mapping[str, Truth], other: Solved | None = None) -> Samples:
-    """Of one set; an instant at which only the `other` run has a pose counts as one without a hand."""
+    """Of one set; a moment at which only the `other` run has a pose counts as one without a hand."""
     out = Samples()
     for piece, truth in truths.items():
         extra = np.zeros(0, np.int64) if other is None else other.of(piece).t_ns
@@ -137,7 +137,7 @@ def _piece(run: Solved, truth: Truth, other_ns: Int) -> Samples:
 
 
 def _missing(t_ns: Int, other_ns: Int, truth: Truth) -> int:
-    """How many instants of the other run, where there is a hand, this one has no pose of."""
+    """How many moments of the other run, where there is a hand, this one has no pose of."""
     if not len(other_ns):
         return 0
     if len(t_ns):
@@ -145,7 +145,7 @@ def _missing(t_ns: Int, other_ns: Int, truth: Truth) -> int:
         near = np.minimum(
             np.abs(t_ns[after - 1] - other_ns), np.abs(t_ns[np.minimum(after, len(t_ns) - 1)] - other_ns)
         )
-        same_ns = 4_000_000  # poses of two runs at most so far apart are of one instant
+        same_ns = 4_000_000  # poses of two runs at most so far apart are of one moment
         other_ns = other_ns[near > same_ns]
     return int(np.isfinite(truth.at(other_ns)[0]).any(axis=(1, 2)).sum())
 
@@ -160,16 +160,16 @@ def _inside(off_m: Float, cov_m2: Float) -> Float:
 
 
 def _rest_mm(run: Solved, truth: Truth, valid: Bool) -> Float:
-    """Steps (R,) [mm] from instant to instant of joints of a hand that rests, less those of the truth."""
+    """Steps (R,) [mm] from moment to moment of joints of a hand that rests, less those of the truth."""
     if len(run.t_ns) < 2 or not truth.continuous:
         return _nothing()
     exact = truth.at(run.t_ns)[0]
     moved_m = np.diff(exact, axis=0)
     known = np.asarray(np.isfinite(moved_m).all(axis=2), np.bool_)
     length = 1e3 * np.linalg.norm(moved_m, axis=2)
-    rest_mm = 0.05  # of the fastest joint from instant to instant: the hand rests
+    rest_mm = 0.05  # of the fastest joint from moment to moment: the hand rests
     rests = known.any(axis=1) & (np.where(known, length, 0.0).max(axis=1) < rest_mm)
-    follows_ns = 60_000_000  # longer apart, two instants are no step
+    follows_ns = 60_000_000  # longer apart, two moments are no step
     rests &= np.diff(run.t_ns) < follows_ns
     step = 1e3 * np.linalg.norm(np.diff(run.position_m, axis=0) - moved_m, axis=2)
     return step[rests[:, None] & known & valid[1:] & valid[:-1]]
@@ -181,7 +181,7 @@ def _lag_m2(run: Solved, truth: Truth, scored: Bool) -> Float:
     if not truth.continuous:
         return out
     whole = np.asarray(scored.any(axis=1), np.bool_)
-    for lag in (LAGS_NS[0], LAGS_NS[-1]):  # the same instants for all lags
+    for lag in (LAGS_NS[0], LAGS_NS[-1]):  # the same moments for all lags
         whole &= np.isfinite(truth.at(run.t_ns - lag)[0]).any(axis=(1, 2))
     long_ns = 300_000_000  # of motion in which a lag can be seen
     if whole.sum() < 2 or np.ptp(run.t_ns[whole]) < long_ns:

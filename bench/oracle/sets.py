@@ -20,15 +20,14 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 from scipy.interpolate import CubicSpline
-from scipy.optimize import least_squares  # pyright: ignore[reportUnknownVariableType]
 from scipy.spatial.transform import Rotation, Slerp
 
 from bench.both.scene import Both, Observed, Shown, markers_shown, shown_of, watched
 from bench.hands.draws import FACING_ROTATION
-from bench.hands.motion import Recorded, held_poses, recordings
+from bench.hands.motion import Recorded, held_poses, nearest, pip_deg, recordings
 from bench.oracle.truth import STEP_NS, Piece, Truth, calibration_files
 from bench.played import START_NS, times_of
-from bench.report import CALIBRATION, command
+from bench.report import CALIBRATION, command, detect
 from bench.rigs.rooms import DESK, ROOM, middle_m, room
 from common.arrays import Float, Int
 from common.errors import RecordingError
@@ -149,18 +148,7 @@ def _markers_detected(folder: Path, tree: Path, hands: Path) -> Piece:
     with tempfile.TemporaryDirectory() as name:
         for camera in rig.cameras:
             target = Path(name) / f"detections_{camera}.npz"
-            command(
-                "slave",
-                "run",
-                "--name",
-                camera,
-                "--camera",
-                f"replay:{folder}",
-                "--calibration",
-                tree,
-                "-o",
-                target,
-            )
+            detect(folder, camera, target, "--calibration", tree)
             messages += recorded_detections(Path(name), camera, len(rig.markers))
             files[f"cameras/{camera}.json"] = msgspec.json.encode(recording.manifest.cameras[camera])
     messages.sort(key=lambda one: one.t_ns)
@@ -181,10 +169,9 @@ def _rendered_truth(folder: Path, continuous: bool) -> Truth:
     steps: Int = int(t_ns[0]) + STEP_NS * np.arange(int(np.ptp(t_ns)) // STEP_NS)
     fine = np.unique(np.concatenate([steps, t_ns]))
     since_s = 1e-9 * (t_ns - t_ns[0])
-    found = [
-        np.asarray(CubicSpline(since_s, rows)(1e-9 * (fine - t_ns[0]))) for rows in (joints_m, angles_rad)
-    ]
-    return Truth(fine, found[0], found[1])
+    at_s = 1e-9 * (fine - t_ns[0])
+    joints, angles = (np.asarray(CubicSpline(since_s, rows)(at_s)) for rows in (joints_m, angles_rad))
+    return Truth(fine, joints, angles)
 
 
 def hand_of(webxr: Float) -> Float:
@@ -251,16 +238,8 @@ def _between(t_s: Float, rows: Float, at_s: float) -> Float:
 
 def _nearest_angles(model: HandModel, fingers_m: Float) -> Float:
     """Angles (T, 20) [rad] nearest to recorded joints (T, 5, 4, 3) [m], palm frame; every other sample is fitted."""
-    rows, out = np.union1d(np.arange(0, len(fingers_m), 2), len(fingers_m) - 1), list[Float]()
-    start = np.zeros(20)
-    for fingers in fingers_m[rows]:
-
-        def off(x: Float, fingers: Float = fingers) -> Float:
-            return (1e3 * (model.chains(x.reshape(5, 4)).position_m - fingers)).ravel()
-
-        start = np.asarray(least_squares(off, start, xtol=1e-4, ftol=1e-4).x, np.float64)
-        out.append(start)
-    found = np.array(out)
+    rows = np.union1d(np.arange(0, len(fingers_m), 2), len(fingers_m) - 1)
+    found = nearest(model, fingers_m[rows], 1e-4)
     columns = [np.interp(np.arange(len(fingers_m)), rows, found[:, k]) for k in range(20)]
     return np.asarray(np.stack(columns, axis=1), np.float64)
 
@@ -274,9 +253,7 @@ def leap(data: Path) -> Iterator[Piece]:
         profile = replace(model.profile, name=name)
         motion = Replayed.of(recorded, model, view_centre(desk.rig))
         scene = Scene.of_motion(replace(desk.rig, hand=name), desk.cameras, profile, motion, seed)
-        files = {
-            key: data for key, data in calibration_files(CALIBRATION, DESK).items() if "hands" not in key
-        }
+        files = {k: v for k, v in calibration_files(CALIBRATION, DESK).items() if "hands" not in k}
         rig = json.loads(files[f"rigs/{DESK}.json"]) | {"hand": name}
         files[f"rigs/{DESK}.json"] = json.dumps(rig).encode()
         files[f"hands/{name}.json"] = msgspec.json.encode(profile)
@@ -311,10 +288,7 @@ def _leap_truth(motion: Replayed) -> Truth:
     joints_m = np.full((len(since_ns), 26, 3), np.nan)
     joints_m[:, CHAINS.ravel()] = [motion.joints(1e-9 * t) for t in since_ns.tolist()]
     angles_rad = np.full((len(since_ns), 5, 4), np.nan)
-    bones = np.diff(joints_m[:, CHAINS[1:]], axis=2)
-    bones /= np.linalg.norm(bones, axis=3, keepdims=True)
-    cosine = (bones[:, :, 0] * bones[:, :, 1]).sum(axis=2)
-    angles_rad[:, 1:, 2] = np.arccos(np.clip(cosine, -1.0, 1.0))
+    angles_rad[:, 1:, 2] = np.radians(pip_deg(joints_m[:, CHAINS.ravel()]))
     return Truth(START_NS + since_ns, joints_m, angles_rad)
 
 
@@ -352,13 +326,11 @@ def _cycles_detected(folder: Path, hands: Path) -> Piece:
     }
     with tempfile.TemporaryDirectory() as name:
         target = Path(name) / f"detections_{camera}.npz"
-        command(
-            "slave", "run", "--name", camera, "--camera", f"replay:{folder}", "--hand", hand, "-o", target
-        )
+        detect(folder, camera, target, "--hand", hand)
         messages = list(recorded_cycles(Path(name), camera))
     found = load_wrist_truth(recording, camera)
     if found is None:
-        raise RecordingError(f"{folder}: nothing says what is true of it")
+        raise RecordingError(f"{folder}: it has no truth")
     angles = angles_of(read_npz(folder / "truth.npz")["angles"])
     truth = Truth(found.t_ns, hand_of(found.joints_m), angles, recording.manifest.continuous)
     return Piece(folder.name, (rig.name,), files, messages, changed(truth, hidden=~found.tip_visible))

@@ -29,13 +29,13 @@ class Truth:
     hidden: Bool | None = None  # (T, 5) fingers of which the sensors that show them best see nothing
 
     def at(self, t_ns: Int) -> tuple[Float, Float]:
-        """Joints (N, 26, 3) and angles (N, 5, 4) at instants (N,); NaN where there is no truth."""
+        """Joints (N, 26, 3) and angles (N, 5, 4) at moments (N,); NaN where there is no truth."""
         rows = np.concatenate([self.joints_m.reshape(-1, 78), self.angles_rad.reshape(-1, 20)], axis=1)
         found = self._moving(rows, t_ns) if self.continuous else self._still(rows, t_ns)
         return found[:, :78].reshape(-1, 26, 3), found[:, 78:].reshape(-1, 5, 4)
 
     def hidden_at(self, t_ns: Int) -> Bool:
-        """Which fingers are hidden at instants (N,), by the row that is nearest: (N, 5)."""
+        """Which fingers are hidden at moments (N,), by the row that is nearest: (N, 5)."""
         if self.hidden is None:
             return np.zeros((len(t_ns), 5), np.bool_)
         after = np.clip(np.searchsorted(self.t_ns, t_ns), 1, max(len(self.t_ns) - 1, 1))

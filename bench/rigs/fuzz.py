@@ -1,9 +1,8 @@
 """Messages of a hostile sender, made from the message types themselves: wrong in one field, or all over.
 
-`hostile` takes a field's type as `msgspec.inspect` describes it, so a new field of a known type is attacked by itself,
-and a field of a type that is not known is an error. An `Attack` turns a plausible message of now into a hostile one, so
-a flood can be made before it is sent and still be of its moment. `attacks` gives all of one type; `flood` draws from
-those of many, with a seed.
+A field's type is taken as `msgspec.inspect` describes it, so a new field of a known type is attacked by itself, and one
+of a type that is not known is an error. An `Attack` turns a plausible message of now into a hostile one, so that a
+flood can be made before it is sent. `attacks` gives all of one type; `flood` draws from those of many, with a seed.
 """
 
 import random
@@ -40,12 +39,9 @@ _MOST_BYTES = 3000  # what fits into a datagram beside the other fields
 def hostile(
     kind: inspect.Type, base: object, source: random.Random, annotation: object = None
 ) -> Iterator[Value]:
-    """All hostile values of one field; TypeError: its type has no values here.
+    """All hostile values of one field with the plausible value `base`, as msgpack has it; TypeError: none are known.
 
-    Args:
-        base: A plausible value of it, as msgpack has it.
-        source: Of what is drawn at random.
-        annotation: Of the field, which gives the dtype of an array.
+    `source`: of what is drawn at random; `annotation`: of the field, which gives the dtype of an array.
     """
     yield from _of_type(kind, base, source, annotation)
     yield from wrong_types(base)
@@ -97,9 +93,8 @@ def _of_type(kind: inspect.Type, base: object, source: random.Random, annotation
         case inspect.LiteralType():
             yield from ((f"{text!r}"[:40], text) for text in (*STRINGS, *kind.values))
         case inspect.BytesType():
-            for size in dict.fromkeys(
-                (0, 1, 15, 17, kind.min_length or 0, (kind.max_length or 0) + 1, _MOST_BYTES)
-            ):
+            sizes = (0, 1, 15, 17, kind.min_length or 0, (kind.max_length or 0) + 1, _MOST_BYTES)
+            for size in dict.fromkeys(sizes):
                 yield f"{size} bytes", source.randbytes(min(size, _MOST_BYTES))
             yield "a JPEG that ends", b"\xff\xd8\xff"
             yield "a JPEG of 30000 x 30000", b"\xff\xd8\xff\xc0\x00\x11\x08\x75\x30\x75\x30\x03" + bytes(300)
@@ -136,9 +131,8 @@ def _numbers(kind: inspect.IntType | inspect.FloatType, values: tuple[float, ...
 def _arrays(dtype: np.dtype[np.generic], base: bytes, source: random.Random) -> Iterator[Value]:
     """Hostile values of an array: wrong sizes; one entry or all hostile; the right entries in other places."""
     item = dtype.itemsize
-    for size in dict.fromkeys(
-        (0, 1, item, len(base) - item, len(base) + item, len(base) + 1, 48 * item, 49 * item)
-    ):
+    sizes = (0, 1, item, len(base) - item, len(base) + item, len(base) + 1, 48 * item, 49 * item)
+    for size in dict.fromkeys(sizes):
         yield f"{size} bytes", bytes(max(size, 0))
     yield "huge", bytes(_MOST_BYTES)
     if len(base) < item:
@@ -190,10 +184,8 @@ def _within_bounds(
         ("of any size within", lambda: source.choice(bounds) * 10.0 ** source.uniform(-12.0, 0.0)),
     ):
         yield f"each {what}", np.array([draw() for _ in whole], dtype).tobytes()
-        yield (
-            f"each {what}, some not seen",
-            np.array([source.choice((draw(), nan)) for _ in whole], dtype).tobytes(),
-        )
+        some = [source.choice((draw(), nan)) for _ in whole]
+        yield f"each {what}, some not seen", np.array(some, dtype).tobytes()
 
 
 def _dicts(kind: inspect.DictType, base: dict[str, object], source: random.Random) -> Iterator[Value]:
@@ -282,10 +274,9 @@ def wire(message: Struct) -> Fields:
     for one in msgspec.structs.fields(type(message)):
         value = getattr(message, one.name)
         dtype = dtype_of(one.type)
+        plain = dtype is None
         out[one.encode_name] = (
-            msgspec.to_builtins(value, builtin_types=(bytes,))
-            if dtype is None
-            else value.astype(dtype).tobytes()
+            msgspec.to_builtins(value, builtin_types=(bytes,)) if plain else value.astype(dtype).tobytes()
         )
     return out
 
@@ -387,12 +378,10 @@ def all_attacks(
     return out
 
 
-def flood(
-    shares: Mapping[type[Struct], float],
-    bases: Mapping[type[Struct], Mapping[str, object]],
-    count: int,
-    seed: int,
-) -> Iterator[Attack]:
+Bases: TypeAlias = Mapping[type[Struct], Mapping[str, object]]
+
+
+def flood(shares: Mapping[type[Struct], float], bases: Bases, count: int, seed: int) -> Iterator[Attack]:
     """Draw `count` attacks, with the message types in these shares.
 
     In half of them one field is wrong, in a tenth three are; the rest is any attack.

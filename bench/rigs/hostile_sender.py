@@ -7,7 +7,6 @@ bus, the rig key in PHALANX_RIG_KEY. It prints `ready` when it has a session, wa
 and prints how many of each type as JSON.
 """
 
-import argparse
 import json
 import os
 import sys
@@ -72,12 +71,8 @@ class Speaker:
         self._seq += 1
         frames = self._frames.get(attack.kind)
         base = self.bases[attack.kind] if frames is None else frames[self._seq % len(frames)]
-        live: Fields = {
-            "session": session,
-            "seq": self._seq,
-            "t_ns": now_ns,
-            "ready_t_ns": now_ns + 1_000_000,
-        }
+        ready_ns = now_ns + 1_000_000
+        live: Fields = {"session": session, "seq": self._seq, "t_ns": now_ns, "ready_t_ns": ready_ns}
         seq = attack.changes.get("seq")
         followed = 10**6
         if isinstance(seq, int) and 0 < seq - self._seq < followed:
@@ -130,9 +125,7 @@ def _seen(uv: Float, value: float) -> Float:
 
 def _sensed(name: str) -> tuple[Struct, ...]:
     six, five = np.ones(6), np.ones(5)
-    uv = np.array(
-        [[260.0, 180.0], [300.0, 150.0], [325.0, 145.0], [350.0, 150.0], [375.0, 170.0], [320.0, 260.0]]
-    )
+    uv = np.stack([(260.0, 300.0, 325.0, 350.0, 375.0, 320.0), (180.0, 150.0, 145.0, 150.0, 170.0, 260.0)], 1)
     line, ids = 100.0 + 40.0 * np.arange(10.0).reshape(5, 2), np.arange(3, dtype=np.uint16)
     corners = 100.0 + 20.0 * np.arange(24.0).reshape(3, 4, 2)
     return (
@@ -173,11 +166,7 @@ def _state(name: str) -> tuple[Struct, ...]:
 
 def _handshakes(name: str) -> tuple[Struct, ...]:
     nonce = bytes(16)
-    return (
-        Hello(name, 1, nonce, nonce, nonce),
-        Started(1),
-        EchoAnswer(1, 2, 3),
-    )
+    return (Hello(name, 1, nonce, nonce, nonce), Started(1), EchoAnswer(1, 2, 3))
 
 
 ON_BUS: Mapping[type[Struct], str] = {Health: "health", Preview: "preview", Still: "still"}  # with its stream
@@ -284,26 +273,18 @@ class HostileSender:
 
 def main() -> None:
     """Get a session, wait for a line, send."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("name")
-    parser.add_argument("tree", type=Path)
-    parser.add_argument("rig")
-    parser.add_argument("port", type=int)
-    parser.add_argument("bus")
-    parser.add_argument("count", type=int)
-    parser.add_argument("per_s", type=float)
-    parser.add_argument("seed", type=int)
-    options = parser.parse_args()
-    setup, key = load_setup(options.tree, options.rig), rig_key(os.environ, None)
-    sender = HostileSender(options.name, key, options.port, setup, options.bus, options.seed)
+    name, tree, rig, port, bus, *numbers = sys.argv[1:]
+    count, per_s, seed = int(numbers[0]), float(numbers[1]), int(numbers[2])
+    setup, key = load_setup(Path(tree), rig), rig_key(os.environ, None)
+    sender = HostileSender(name, key, int(port), setup, bus, seed)
     spare = 1.05  # so many more are made, for those that fit into no datagram
-    attacks = list(sender.attacks(round(spare * options.count)))
+    attacks = list(sender.attacks(round(spare * count)))
     if not sender.uplink.wait_for_start(60.0):
         raise SystemExit("no master: does it have this device, this key and this beacon port?")
     print("ready", flush=True)
     sys.stdin.readline()
     began = time.monotonic()
-    sender.send_all(attacks, options.count, options.per_s)
+    sender.send_all(attacks, count, per_s)
     seconds = time.monotonic() - began
     print(json.dumps({"seconds": seconds, **sender.sent}), flush=True)
     sender.close()

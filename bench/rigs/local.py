@@ -24,7 +24,6 @@ from common.messages.streams import MASTER
 UP_S = 90.0
 _PORTS = range(15_000, 32_000)  # below those that Linux assigns by itself (32768 to 60999)
 _TICKS = os.sysconf("SC_CLK_TCK")
-_ROLLED = {"Rss": "rss_mb", "Pss": "pss_mb", "Anonymous": "anonymous_mb"}
 _KB = re.compile(r"^(\w+):\s+(\d+)", re.MULTILINE)
 _STEP_S = 0.02
 
@@ -47,12 +46,15 @@ def free_port(kind: int) -> int:
     raise OSError(f"of {tries} ports from {_PORTS.start} to {_PORTS.stop - 1} none was free")
 
 
-def join_bus(endpoint: str, patience_s: float, environment: Mapping[str, str] = os.environ) -> ZenohBus:
+def join_bus(
+    endpoint: str, patience_s: float, environment: Mapping[str, str] = os.environ, site: str | None = None
+) -> ZenohBus:
     """Join the bus of a master that is about to listen at `endpoint`; BusError: it did not within `patience_s`."""
     deadline = time.monotonic() + patience_s
     while True:
         try:
-            return ZenohBus(None, endpoint, access_of(environment, OPERATOR), beyond=True)
+            access = access_of(environment, OPERATOR)
+            return ZenohBus(None, endpoint, access, beyond=True, namespace=site)
         except BusError:
             if time.monotonic() > deadline:
                 raise
@@ -74,24 +76,14 @@ class Footprint:
     """A process at a moment (Linux, /proc)."""
 
     rss_mb: float  # resident memory [MB = 1e6 bytes], pages that it shares with others included
-    pss_mb: float  # the same, each shared page divided by those that share it
-    uss_mb: float  # pages that nobody shares
     anonymous_mb: float  # pages that are no file's: heap, stacks, arrays
     cpu_s: float  # processor time since it began, user and system
-    threads: int
-    files: int
 
 
 def footprint(pid: int) -> Footprint:
     """Read the footprint of a process; OSError: there is none, or it belongs to somebody else."""
-    folder = Path(f"/proc/{pid}")
-    rolled, status = (
-        {k: int(v) for k, v in _KB.findall((folder / f).read_text())} for f in ("smaps_rollup", "status")
-    )
-    mb = {mine: rolled[theirs] * 1024e-6 for theirs, mine in _ROLLED.items()}
-    private = (rolled["Private_Clean"] + rolled["Private_Dirty"]) * 1024e-6
-    files = sum(1 for _ in (folder / "fd").iterdir())
-    return Footprint(**mb, uss_mb=private, cpu_s=cpu_s(pid), threads=status["Threads"], files=files)
+    kb = dict(_KB.findall(Path(f"/proc/{pid}/smaps_rollup").read_text()))
+    return Footprint(int(kb["Rss"]) * 1024e-6, int(kb["Anonymous"]) * 1024e-6, cpu_s(pid))
 
 
 def cpu_s(pid: int, task: str = "") -> float:
@@ -186,18 +178,14 @@ class Rig:
         before = log.read_text().count(ready) if ready and log.exists() else 0
         with log.open("ab") as file:
             process = self.processes[name] = subprocess.Popen(
-                [sys.executable, "-m", *words],
-                cwd=ROOT,
-                env=self.environment | environment,
-                stdin=subprocess.PIPE,
-                stdout=file,
-                stderr=subprocess.STDOUT,
-                text=True,
-                start_new_session=True,
-            )
-        if ready and not until(
-            lambda: log.read_text().count(ready) > before or process.poll() is not None, UP_S
-        ):
+                [sys.executable, "-m", *words], cwd=ROOT, env=self.environment | environment, text=True,
+                stdin=subprocess.PIPE, stdout=file, stderr=subprocess.STDOUT, start_new_session=True,
+            )  # fmt: skip
+
+        def up() -> bool:
+            return log.read_text().count(ready) > before or process.poll() is not None
+
+        if ready and not until(up, UP_S):
             raise RigError(f"{name} does not come up: {log}")
 
     def start_master(
@@ -267,9 +255,8 @@ def losses(health: Mapping[str, Health]) -> dict[str, int]:
     had no time. refused: came, and was not accepted. blocked: not sent by a full socket.
     """
     master = health[MASTER].counts if MASTER in health else {}
-    out = {
-        name: sum(n for key, n in master.items() if key.endswith(f".{name}")) for name in ("lost", "skipped")
-    }
+    ending = ("lost", "skipped")
+    out = {name: sum(n for key, n in master.items() if key.endswith(f".{name}")) for name in ending}
     out["dropped"] = master.get("queue.dropped", 0)
     out["refused"] = sum(n for key, n in master.items() if key.startswith("refused."))
     sockets = ("would_block", "send_failed")

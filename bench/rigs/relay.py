@@ -49,7 +49,7 @@ class UdpRelay:
         self.seen: Callable[[bytes, bool], None] | None = None
         self._random = random.Random(seed)
         self._slaves: Address = (_BROADCAST, slave_beacon_port)
-        self._inlet, self._front = _socket(), _socket()  # hears the master's beacons; speaks with the slaves
+        self._inlet, self._front = _socket(), _socket()  # for the master's beacons; for the slaves
         self._backs: dict[Address, socket.socket] = {}  # slave -> its socket towards the master
         self._master: Address | None = None
         self._waiting: list[tuple[float, int, socket.socket, bytes, Address]] = []

@@ -1,22 +1,20 @@
 """2 to 16 simulated cameras before real masters: what each costs, what is lost, how late the poses are.
 
-As one room round a hand, and as a building of desks with a master each. Cameras send exact projections, so that this
-machine is the masters' alone; datagrams are sealed and go over real UDP. What others do on the machine shows in
-latencies: each figure has the load beside it. `--page` writes the measurement into docs/scale.html, which computes
-rooms and buildings from it, and its table into docs/scale.md. `hop_ms` measures a relay and two routers in a chain.
+As one room round a hand, and as a building of desks with a master each. Cameras send exact projections in sealed
+datagrams over real UDP; the load of the machine stands beside each figure. `--page` writes the measurement into
+docs/scale.html, which computes rooms and buildings from it, and its table into docs/scale.md.
 """
 
 import argparse
 import json
 import os
-import platform
 import re
 import socket
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from math import nan
 from pathlib import Path
 from statistics import median
@@ -24,11 +22,11 @@ from typing import cast
 
 import numpy as np
 
-from bench.report import CALIBRATION
-from bench.rigs.local import UP_S, Rig, RigError, cpu_s, free_port, losses, until
+from bench.report import CALIBRATION, machine
+from bench.rigs.local import UP_S, Rig, RigError, cpu_s, free_port, join_bus, losses, until
 from bench.rigs.rooms import DESK, ROOM, detections, in_order, room, slower
 from common.bus.bus import Subscription
-from common.bus.keys import OPERATOR, access_of
+from common.bus.keys import access_of
 from common.bus.zenoh_bus import ZenohBus
 from common.errors import BusError
 from common.link.datagram import OVERHEAD
@@ -57,10 +55,12 @@ def hop_ms(folder: Path) -> tuple[float, float]:
         rig.start("relay", "master", "fleet", "relay", "--bus", near, "--router", routers[0], "--site", SITE)
         inboxes: list[Subscription] = []
         for endpoint, site in ((near, None), (routers[1], SITE)):
-            bus = _reader(endpoint, rig, site)
+            bus = join_bus(endpoint, UP_S, rig.environment, site)
             stack.callback(bus.close)
             inboxes.append(bus.subscribe("gesture", depth=4 * _MESSAGES))
-        _until_received(master, inboxes)
+        for inbox in inboxes:
+            if not until(lambda inbox=inbox: _asked(master, inbox), UP_S):
+                raise BusError("nothing comes through the routers")
         ages_ms = [_ages_ms(master, inbox) for inbox in inboxes]
     # The rare long ones at the master are of another moment of the machine: they are no part of what hops add.
     typical = float(np.median(ages_ms[0]))
@@ -69,25 +69,9 @@ def hop_ms(folder: Path) -> tuple[float, float]:
     return (p50 - typical) / hops, (p99 - typical) / hops
 
 
-def _reader(endpoint: str, rig: Rig, site: str | None) -> ZenohBus:
-    deadline = time.monotonic() + UP_S
-    while True:
-        try:
-            access = access_of(rig.environment, OPERATOR)
-            return ZenohBus(None, endpoint, access, beyond=True, namespace=site)
-        except BusError:
-            if time.monotonic() > deadline:
-                raise
-            time.sleep(0.2)
-
-
-def _until_received(master: ZenohBus, inboxes: list[Subscription]) -> None:
-    deadline = time.monotonic() + UP_S
-    for inbox in inboxes:
-        while inbox.get(0.05) is None:
-            if time.monotonic() > deadline:
-                raise BusError("nothing comes through the routers")
-            master.publish("gesture", "hand", _now())
+def _asked(master: ZenohBus, inbox: Subscription) -> bool:
+    master.publish("gesture", "hand", _now())
+    return inbox.get(0.05) is not None
 
 
 def _ages_ms(master: ZenohBus, inbox: Subscription) -> list[float]:
@@ -164,10 +148,10 @@ def _replace(file: Path, place: re.Pattern[str], new: str) -> None:
 
 
 BUILDING = "building"
+CAMERAS, SECONDS = (2, 4, 8, 16), 8.0
+RATES_HZ = {ROOM: 90.0, BUILDING: 15.0}  # of a building less, whose masters share this machine
 # Stages whose cost does not depend on the number of cameras.
 PER_HAND = ("hand", "filter", "fabrik", "gestures")
-_WORST = ("lost", "dropped", "blocked", "refused")
-_WARM = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,9 +202,8 @@ def measure(folder: Path, layout: str, cameras: int, rate_hz: float, seconds: fl
     if layout == ROOM:
         tree = room(folder, cameras, rate_hz)
     else:
-        tree = slower(
-            folder, dict.fromkeys(load_setup(CALIBRATION, DESK).camera_names, rate_hz), row_time_us=0.0
-        )
+        names = load_setup(CALIBRATION, DESK).camera_names
+        tree = slower(folder, dict.fromkeys(names, rate_hz), row_time_us=0.0)
     with ExitStack() as stack:
         rigs, received = list[Rig](), list[_Received]()
         for k in range(masters):
@@ -314,9 +297,9 @@ def solve_us(cameras: int, rate_hz: float) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as name:
         setups = load_setups(room(Path(name), cameras, rate_hz), [ROOM])
     messages = in_order(detections(setups[0], rate_hz))
-    stages = StageTimes(time.thread_time_ns)
+    stages, warmed = StageTimes(time.thread_time_ns), 20
     dispatcher = Dispatcher(setups, [LivePipeline(setup, stages) for setup in setups], stages)
-    warm, last = _WARM * cameras, (_WARM + 200) * cameras
+    warm, last = warmed * cameras, (warmed + 200) * cameras
     for message in messages[:warm]:
         list(dispatcher.push(message))
     before, poses = stages.total_us(), dispatcher.counts["poses"]
@@ -350,17 +333,12 @@ def summary(runs: Sequence[ScaleRun], stages: dict[int, dict[str, float]]) -> di
             "latency_p50_ms": {str(one.cameras): round(one.latency_p50_ms, 1) for one in rooms},
             "latency_p99_ms": {str(one.cameras): round(one.latency_p99_ms, 1) for one in rooms},
         }
-    all_runs: dict[str, object] = {
-        f"{one.layout} {one.cameras}": asdict(one)
-        | {"without_hand": cost_per_camera(one, stages.get(one.cameras, {}))}
-        for one in runs
-    }
+    all_runs: dict[str, object] = {}
+    for one in runs:
+        alone = cost_per_camera(one, stages.get(one.cameras, {}))
+        all_runs[f"{one.layout} {one.cameras}"] = asdict(one) | {"without_hand": alone}
     return {
-        "machine": {
-            "machine": platform.machine(),
-            "cores": os.cpu_count(),
-            "python": platform.python_version(),
-        },
+        "machine": machine(),
         "model": model,
         "runs": all_runs,
         "stages_us": {str(count): dict(us) for count, us in stages.items()},
@@ -379,56 +357,22 @@ def cost_per_camera(run: ScaleRun, stages: dict[str, float]) -> float:
     return (run.cores - run.masters * run.poses_hz * hand_us * 1e-6) / run.cameras
 
 
-def _median(layout: str, cameras: int, rate_hz: float, seconds: float, repeat: int) -> ScaleRun:
-    """Return the run of median cost; of what must not happen the worst of all."""
-    with tempfile.TemporaryDirectory() as name:
-        found = [measure(Path(name) / str(k), layout, cameras, rate_hz, seconds) for k in range(repeat)]
-    worst = {name: max(cast(int, getattr(one, name)) for one in found) for name in _WORST}
-    return replace(sorted(found, key=lambda one: one.cores)[len(found) // 2], **worst)
-
-
 def main(arguments: Sequence[str]) -> int:
     """Run it; 1 where a message was lost."""
     parser = argparse.ArgumentParser("python -m bench scale", description=__doc__)
-    counts = parser.add_argument("--cameras", type=_counts, default=(2, 4, 8, 16), metavar="N,N")
-    counts.help = "how many (default: 2,4,8,16)"
-    parser.add_argument(
-        "--hz", type=float, default=90.0, help="of each camera of a room (default: %(default)s)"
-    )
-    hz = parser.add_argument("--building-hz", type=float, default=15.0)
-    hz.help = "of each camera of a building, whose masters share this machine (default: %(default)s)"
-    parser.add_argument("--seconds", type=float, default=8.0, help="of each run (default: %(default)s)")
-    parser.add_argument("--repeat", type=int, default=1, help="runs, of which the median counts (default: 1)")
-    parser.add_argument("--only", choices=(ROOM, BUILDING), help="default: both")
-    parser.add_argument("--out", type=Path, default=Path("out/scale"), help="folder (default: %(default)s)")
     parser.add_argument("--page", type=Path, metavar="FILE", help="write the measurement into this page")
-    options = parser.parse_args(arguments)
-    layouts = [one for one in (ROOM, BUILDING) if options.only in (None, one)]
-    runs: list[ScaleRun] = []
-    python = platform.python_version()
-    print(f"{platform.machine()}, {os.cpu_count()} cores, Python {python}; {options.seconds:g} s each")
-    stages = {count: solve_us(count, options.hz) for count in options.cameras} if ROOM in layouts else {}
-    for layout in layouts:
-        rate_hz = options.hz if layout == ROOM else options.building_hz
-        print(f"\n{layout}, {rate_hz:g} Hz\n{_TABLE_HEAD}", flush=True)
-        for count in options.cameras:
-            runs.append(_median(layout, count, rate_hz, options.seconds, options.repeat))
-            alone = cost_per_camera(runs[-1], stages.get(count, {}))
-            print(_table_row(asdict(runs[-1]) | {"without_hand": alone}), flush=True)
-    for count, us in stages.items():
-        by_stage = ", ".join(f"{name} {value:.0f}" for name, value in us.items())
-        print(f"  {count:2d} cameras, us of processor a pose: {by_stage}")
-    found = summary(runs, stages)
+    page = parser.parse_args(arguments).page
+    runs, stages = list[ScaleRun](), {count: solve_us(count, RATES_HZ[ROOM]) for count in CAMERAS}
     with tempfile.TemporaryDirectory() as name:
-        hops = hop_ms(Path(name))
+        for layout, rate_hz in RATES_HZ.items():
+            print(f"\n{layout}, {rate_hz:g} Hz\n{_TABLE_HEAD}", flush=True)
+            for count in CAMERAS:
+                runs.append(measure(Path(name) / f"{layout}{count}", layout, count, rate_hz, SECONDS))
+                alone = cost_per_camera(runs[-1], stages[count])
+                print(_table_row(asdict(runs[-1]) | {"without_hand": alone}), flush=True)
+        found, hops = summary(runs, stages), hop_ms(Path(name))
     found["model"] |= {"hop_p50_ms": round(hops[0], 2), "hop_p99_ms": round(hops[1], 2)}
-    print("\n" + "\n".join(f"{name}: {value}" for name, value in found["model"].items()))
-    options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "scale.json").write_text(json.dumps(found, indent=1) + "\n")
-    if options.page is not None:
-        into_page(options.page, found)
-    return 1 if any(one.lost + one.dropped + one.blocked for one in runs) else 0
-
-
-def _counts(text: str) -> tuple[int, ...]:
-    return tuple(int(one) for one in text.split(","))
+    print(json.dumps({name: found[name] for name in ("model", "stages_us")}, indent=1))
+    if page is not None:
+        into_page(page, found)
+    return int(any(one.lost + one.dropped + one.blocked for one in runs))

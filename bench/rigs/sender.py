@@ -82,11 +82,8 @@ def send(cameras: Sequence[Camera], clock: SkewedClock, epoch_ns: int, stop: thr
 def main() -> None:
     """Send until standard input ends."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("tree", type=Path)
-    parser.add_argument("rig")
-    parser.add_argument("rate_hz", type=float)
-    parser.add_argument("port", type=int)
-    parser.add_argument("epoch_ns", type=int)
+    for name, kind in (("tree", Path), ("rig", str), ("rate_hz", float), ("port", int), ("epoch_ns", int)):
+        parser.add_argument(name, type=kind)
     parser.add_argument("--cameras", nargs="*", help="these alone")
     parser.add_argument("--way", action="store_true", help="the scene goes forth and back")
     parser.add_argument("--clock-s", type=float, default=0.0, help="offset of its clock")

@@ -8,7 +8,6 @@ the bus is encrypted by keys of this run. Ctrl-C ends it early: the verdict is t
 import argparse
 import json
 import os
-import platform
 import threading
 import time
 from collections.abc import Sequence
@@ -18,22 +17,11 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from bench.report import COLOURS, figure
+from bench.report import COLOURS, figure, machine
+from bench.rigs import soak_verdict as verdict
 from bench.rigs.local import Rig, cpu_s, losses
 from bench.rigs.rooms import slower
-from bench.rigs.soak_verdict import (
-    Finding,
-    Mapping,
-    Minute,
-    SoakHistory,
-    grown,
-    judge,
-    mapped,
-    memory_slope,
-    slope,
-    steps_of,
-    warm_up_s,
-)
+from bench.rigs.soak_verdict import Mapping, Minute, SoakHistory, grown, judge, mapped, warm_up_s
 from common.calibration.files import replacing
 from common.messages import HandPose, Health
 from common.messages.streams import MASTER
@@ -43,7 +31,7 @@ RIGS = ("desk", "wrist")
 DEVICES = {"left": "desk", "right": "desk", "wrist": "wrist", "imu": "wrist"}  # -> rig
 SCENE = "both-poses"  # closed: it can go on for ever; slow enough for three frames of a triple at a low rate
 DRIFT_PPM = {"left": 20.0, "right": -35.0, "wrist": 50.0, "imu": 8.0}
-_GREY = "#777777"
+_GREY, OUT = "#777777", Path("out/soak")
 
 
 class SoakRig(Rig):
@@ -100,18 +88,12 @@ class SoakRig(Rig):
         took = now_s - self._since_s
         p50, p99 = np.percentile(latency_ms, [50, 99]) if latency_ms else (np.nan, np.nan)
         metrics = health[MASTER].metrics if MASTER in health else {}
-        minute = Minute(
-            now_s,
-            len(latency_ms) / took,
-            float(p50),
-            float(p99),
-            os.getloadavg()[0],
-            {name: (spent_s[name] - self._cpu_s[name]) / took for name in spent_s},
-            losses(health),
-            _ending(metrics, ".clock_offset_us"),
-            _ending(metrics, ".clock_sigma_us"),
-            {name: more for name, now in maps.items() if (more := grown(self._mapped[name], now))},
-        )
+        cores = {name: (spent_s[name] - self._cpu_s[name]) / took for name in spent_s}
+        figures = (len(latency_ms) / took, float(p50), float(p99), os.getloadavg()[0], cores, losses(health))
+        end = ".clock_offset_us"
+        clocks = {name.removesuffix(end): us for name, us in metrics.items() if name.endswith(end)}
+        more = {name: grown(self._mapped[name], now) for name, now in maps.items()}
+        minute = Minute(now_s, *figures, clocks, {name: mb for name, mb in more.items() if mb})
         self.course.minutes.append(minute)
         self.course.counts = {name: dict(one.counts) for name, one in health.items()}
         self._since_s, self._cpu_s, self._mapped = now_s, spent_s, maps
@@ -129,11 +111,6 @@ class SoakRig(Rig):
 
     def _maps(self) -> dict[str, list[Mapping]]:
         return {name: mapped(one.pid) for name, one in self.processes.items()}
-
-
-def _ending(metrics: dict[str, float], end: str) -> dict[str, float]:
-    """Return sender -> value, of the gauges with this ending."""
-    return {name.removesuffix(end): value for name, value in metrics.items() if name.endswith(end)}
 
 
 def draw(course: SoakHistory, title: str, file: Path) -> None:
@@ -161,10 +138,10 @@ def _growth(axes: Axes, course: SoakHistory) -> None:
     for colour, name in zip(COLOURS, course.footprints, strict=False):
         values = np.array(course.series(name, "rss_mb"))
         if late.any():
-            label = f"{name} {memory_slope(course, name).per_h:+.2f} MB/h"
+            label = f"{name} {verdict.memory_slope(course, name).per_h:+.2f} MB/h"
             since = values - np.median(values[late][:12])
             axes.plot(times / 60.0, since, color=colour, label=label, linewidth=1.2)
-        for step in steps_of(course.times_s, values) or []:
+        for step in verdict.steps_of(course.times_s, values) or []:
             axes.axvline(step.minute, color=colour, linewidth=1.0, linestyle="--")
             axes.text(step.minute, 2.6, f" +{step.mb:.0f} MB", color=colour, fontsize=8)
     axes.axhline(1.0, color=_GREY, linewidth=0.8, linestyle=":")
@@ -206,7 +183,7 @@ def _clocks(axes: Axes, course: SoakHistory) -> None:
         known = [(one.t_s, one.clock_offset_us[name]) for one in late if name in one.clock_offset_us]
         if len(known) > 2:
             times, offsets = np.array(known).T
-            ppm = slope(times, offsets).per_h / 3600.0
+            ppm = verdict.slope(times, offsets).per_h / 3600.0
             left = offsets - ppm * times
             axes.plot(times / 60.0, left - np.median(left), color=colour, label=f"{name} {ppm:+.2f} ppm")
     axes.set_ylabel("clock, without its\nstraight line [us]")
@@ -214,10 +191,10 @@ def _clocks(axes: Axes, course: SoakHistory) -> None:
 
 def _run(options: argparse.Namespace, stop: threading.Event) -> tuple[SoakHistory, list[str]]:
     """Run for the time asked for, or until `stop`; return what was measured, and who ended by himself."""
-    rig = SoakRig(options.out, options.marker_hz, options.wrist_hz)
+    rig = SoakRig(OUT, options.marker_hz, options.wrist_hz)
     try:
         names = ", ".join(f"{name} (pid {one.pid})" for name, one in rig.processes.items())
-        print(f"started {names}; logs in {options.out}", flush=True)
+        print(f"started {names}; logs in {OUT}", flush=True)
         listen_s, minute_s = 0.5, 60.0
         next_s, next_minute_s = 0.0, minute_s
         while not stop.wait(listen_s) and rig.now_s < minute_s * options.minutes:
@@ -225,7 +202,7 @@ def _run(options: argparse.Namespace, stop: threading.Event) -> tuple[SoakHistor
                 return rig.course, gone
             if rig.now_s >= next_s:
                 rig.measure()
-                next_s += options.every_s
+                next_s += 5.0
             if rig.now_s >= next_minute_s:
                 _show(rig.end_minute(), rig.course)
                 _save(options, rig.course)
@@ -247,17 +224,15 @@ def _show(minute: Minute, course: SoakHistory) -> None:
     )
 
 
-def _save(options: argparse.Namespace, course: SoakHistory, findings: Sequence[Finding] = ()) -> None:
+def _save(options: argparse.Namespace, course: SoakHistory, findings: Sequence[verdict.Finding] = ()) -> None:
     """Save all figures so far; whoever kills the soak still has them."""
     known = {
-        "machine": platform.machine(),
-        "cores": os.cpu_count(),
-        "python": platform.python_version(),
+        **machine(),
         "marker_hz": options.marker_hz,
         "wrist_hz": options.wrist_hz,
         "verdict": [asdict(one) for one in findings],
     }
-    with replacing(options.out / "soak.json") as file:
+    with replacing(OUT / "soak.json") as file:
         file.write(json.dumps(known | course.plain()).encode())
 
 
@@ -268,10 +243,8 @@ def main(arguments: Sequence[str]) -> int:
         ("--minutes", 60.0, "length; five are a rehearsal, too short to judge memory"),
         ("--marker-hz", 10.0, "of each marker camera; 60 are those of real ones, on six cores or more"),
         ("--wrist-hz", 12.0, "frames; three a triple"),
-        ("--every-s", 5.0, "memory is read so often"),
     ):
         parser.add_argument(flag, type=float, default=default, help=f"{text} (default: %(default)s)")
-    parser.add_argument("--out", type=Path, default=Path("out/soak"), help="folder (default: %(default)s)")
     options = parser.parse_args(arguments)
     course, ended = _run(options, stop_on_signals())
     findings = judge(course, ended)
@@ -279,10 +252,10 @@ def main(arguments: Sequence[str]) -> int:
     rates = f"marker cameras {options.marker_hz:g} Hz, wrist {options.wrist_hz:g} Hz"
     title = f"{length_min:.0f} minutes, {rates}"
     _save(options, course, findings)
-    draw(course, title, options.out / "soak.png")
+    draw(course, title, OUT / "soak.png")
     print(f"\n{title}")
     for one in findings:
         mark = {True: "ok", False: "NOT OK", None: "too short"}[one.ok]
         print(f"  {one.what:24s} {one.value:44s} {one.limit:16s} {mark}")
-    print(f"wrote {options.out / 'soak.png'} and {options.out / 'soak.json'}")
+    print(f"wrote {OUT / 'soak.png'} and {OUT / 'soak.json'}")
     return 1 if any(one.ok is False for one in findings) else 0

@@ -1,21 +1,19 @@
 """The verdict of a soak: does memory grow or step, does latency grow, was anything lost?
 
-Memory and latency on a machine that others use as well are noisy, and noise has outliers: slopes are those of Theil and
-Sen (median of the slopes of all pairs, P. K. Sen, "Estimates of the regression coefficient based on Kendall's tau",
-1968), with Sen's interval of 95 %, widened where what is left is correlated. A process that keeps more and more raises
-the least, too, whoever else is busy: of latency the quietest minute of every five is judged.
-
-Memory that rises at once and stays is hardly seen by such a slope: steps are found for themselves, and the mapping of
-the process in which they came. A step is what a buffer makes that comes late, or memory that is freed and kept by the C
-library.
+Slopes are those of Theil and Sen (median of the slopes of all pairs, P. K. Sen 1968), with Sen's interval of 95 %,
+widened where what is left is correlated. Of latency the quietest minute of every five is judged: a process that keeps
+more and more raises the least, too. Memory that rises at once and stays is hardly seen by a slope: steps are found for
+themselves, and the mapping of the process in which they came.
 """
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from math import nan, sqrt
 from pathlib import Path
+from statistics import NormalDist
 
 import numpy as np
+from scipy.stats import theilslopes  # pyright: ignore[reportUnknownVariableType]
 
 from bench.rigs.local import Footprint
 from common.arrays import Float
@@ -40,7 +38,6 @@ class Minute:
     cores: dict[str, float]  # process -> processor time in seconds a second
     counts: dict[str, int]  # of the master since the start: lost, skipped, dropped, refused, blocked
     clock_offset_us: dict[str, float]  # sender -> by how much its clock is ahead of the master's
-    clock_sigma_us: dict[str, float]  # sender -> how sure the master is of that
     grown: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
 
 
@@ -162,22 +159,15 @@ def slope(times_s: Sequence[float] | Float, values: Sequence[float] | Float) -> 
     """Return Theil and Sen's slope of `values` (N,) over times (N,) [s]; NaN values are left out."""
     t, y = np.asarray(times_s, np.float64) / 3600.0, np.asarray(values, np.float64)
     t, y = t[np.isfinite(y)], y[np.isfinite(y)]
-    n = len(t)
-    if n < _FEWEST:
+    if len(t) < _FEWEST:
         return Slope(nan, nan, nan)
-    one, other = np.triu_indices(n, 1)
-    pairs = np.sort((y[other] - y[one]) / (t[other] - t[one]))
-    middle = float(np.median(pairs))
-    left = y - middle * t
+    left = y - np.asarray(theilslopes(y, t), np.float64)[0] * t
     left -= left.mean()
     power = float(left @ left)
-    r = float(left[1:] @ left[:-1]) / power if power > 0 else 0.0
-    wider = sqrt((1.0 + max(r, 0.0)) / (1.0 - min(max(r, 0.0), 0.95)))
-    z95 = 1.96
-    spread = z95 * wider * sqrt(n * (n - 1) * (2 * n + 5) / 18.0)
-    low = round((len(pairs) - spread) / 2.0)
-    high = round((len(pairs) + spread) / 2.0)
-    return Slope(middle, float(pairs[max(low, 0)]), float(pairs[min(high, len(pairs) - 1)]))
+    r = max(float(left[1:] @ left[:-1]) / power, 0.0) if power > 0 else 0.0
+    wider = sqrt((1.0 + r) / (1.0 - min(r, 0.95)))
+    found = np.asarray(theilslopes(y, t, 2.0 * NormalDist().cdf(1.96 * wider) - 1.0), np.float64)
+    return Slope(*found[[0, 2, 3]].tolist())
 
 
 def warm_up_s(length_s: float) -> float:
@@ -194,10 +184,7 @@ def memory_slope(course: SoakHistory, process: str, quantity: str = "rss_mb") ->
     late = times >= warm_up_s(times[-1])
     blocks = [k for k in np.unique(block) if (late & (block == k)).any()]
     chosen = [late & (block == k) for k in blocks]
-    return slope(
-        [float(np.median(times[which])) for which in chosen],
-        [float(np.median(values[which])) for which in chosen],
-    )
+    return slope(*([float(np.median(of[which])) for which in chosen] for of in (times, values)))
 
 
 def latency_slope(minutes: Sequence[Minute], quantity: str) -> Slope:
@@ -216,25 +203,17 @@ def judge(course: SoakHistory, ended: Sequence[str]) -> list[Finding]:
     """Return the verdict; `ended` are processes that ended by themselves."""
     findings = [Finding("processes that ended", ", ".join(ended) or "none", "none", not ended)]
     for process in course.footprints:
-        found = memory_slope(course, process)
-        mb_per_h = 1.0
-        findings.append(
-            Finding(
-                f"memory of {process}",
-                "too short to say"
-                if np.isnan(found.per_h)
-                else f"{found.per_h:+.2f} MB/h ({found.low:+.2f} ... {found.high:+.2f})",
-                f"{mb_per_h:g} MB/h",
-                None if np.isnan(found.per_h) else found.per_h <= mb_per_h,
-            )
-        )
+        found, mb_per_h, value, ok = memory_slope(course, process), 1.0, "too short to say", None
+        if not np.isnan(found.per_h):
+            value = f"{found.per_h:+.2f} MB/h ({found.low:+.2f} ... {found.high:+.2f})"
+            ok = found.per_h <= mb_per_h
+        findings.append(Finding(f"memory of {process}", value, f"{mb_per_h:g} MB/h", ok))
     findings += [_steps(course, process) for process in course.footprints]
     findings += [_latency(course.minutes, name) for name in ("p50", "p99")]
     counts = course.minutes[-1].counts if course.minutes else {}
     for what in ("lost", "dropped", "refused", "blocked"):
-        findings.append(
-            Finding(what, str(counts.get(what, 0)), "0", counts.get(what, 0) == 0 if counts else None)
-        )
+        gone = counts.get(what, 0)
+        findings.append(Finding(what, str(gone), "0", gone == 0 if counts else None))
     return findings
 
 

@@ -1,12 +1,9 @@
 """Simulated participants, and what the real line makes of what they do before the camera.
 
-Each has a hand with its own bones, a device a little askew, darker or brighter skin, drawn from the study's seed and a
-number. Known of somebody before a trial are bones as a hand calibration measures them, and what
-`master.calibrate.wrist.subject` makes of the guided motion that this person performed; never the skin.
-
-Every block has the six poses in an order of its own: from one pose to the next the fingers go within half a second,
-then hold for a fifth of one; a trial is what is held. Each trial has its own posture, near the pose, and drifts slowly
-as hands do (`Stations`). Frames are rendered, detected by `phalanx-slave run -o` and solved as a replay is.
+Each has a hand with its own bones, a device a little askew, darker or brighter skin. Known of somebody are bones as a
+hand calibration measures them, and what `master.calibrate.wrist.subject` makes of the guided motion of this person.
+Every block has the six poses in an order of its own; a trial is the fifth of a second for which one is held. Frames are
+rendered, detected by `phalanx-slave run -o` and solved as a replay is.
 """
 
 from dataclasses import dataclass
@@ -17,7 +14,7 @@ import numpy as np
 from msgspec import convert
 from msgspec.structs import replace
 
-from bench.report import command
+from bench.report import detect
 from common.arrays import Bool, Float
 from common.calibration import CameraCalibration, HandProfile, RestJoint, RigCalibration, save
 from common.calibration.files import Matrix4
@@ -73,19 +70,11 @@ def participant(study_seed: int, number: int, rig: RigCalibration, hand: HandPro
     rotation, shift = rng.uniform(-ROTATION_RAD, ROTATION_RAD, 3), rng.uniform(-SHIFT_M, SHIFT_M, 3)
     reflectance_share = 0.2
     reflectance = 1.0 + float(rng.uniform(-reflectance_share, reflectance_share))
-    lengths = _lengths(typical)
-    wrong = _bone_errors(rng) / lengths
+    wrong = _bone_errors(rng) / _lengths(typical)
     palm_sigma = 0.01  # of the palm's length, by a ruler: 1 mm of 9 cm
-    return Participant(
-        number=number,
-        seed=1000 * study_seed + number,
-        hand=with_bones(typical, palm, bones),
-        measured=_measured(
-            with_bones(typical, palm * (1.0 + palm_sigma * float(rng.normal())), bones + wrong)
-        ),
-        rig=rotated(rig, rotation, shift),
-        reflectance=reflectance,
-    )
+    known = with_bones(typical, palm * (1.0 + palm_sigma * float(rng.normal())), bones + wrong)
+    hands = with_bones(typical, palm, bones), _measured(known)
+    return Participant(number, 1000 * study_seed + number, *hands, rotated(rig, rotation, shift), reflectance)
 
 
 def about(rig: RigCalibration) -> RigCalibration:
@@ -131,9 +120,7 @@ def _measured(hand: HandProfile) -> HandProfile:
 
 def _lengths(hand: HandProfile) -> Float:
     """Bone lengths (5, 3) [m], three for each finger, of the thumb with its metacarpal."""
-    place = [
-        [np.array(hand.rest_joints[JOINTS[j]].position_m) for j in chain[-4:]] for chain in FINGER_JOINTS
-    ]
+    place = [[hand.rest_joints[JOINTS[j]].position_m for j in chain[-4:]] for chain in FINGER_JOINTS]
     return np.linalg.norm(np.diff(np.array(place), axis=1), axis=2)
 
 
@@ -162,7 +149,7 @@ class Task:
     hand: HandProfile
     seed: int  # of the study
     blocks: int  # how often the six poses are made
-    solver_mode: SolverMode | None = None  # of the master; None: what the rig file says
+    solver_mode: SolverMode | None = None  # of the master; None: that of the rig file
     step: int = 2  # pixels between the rays that shade skin
     guided: int = 96  # triples of the guided motion
     trial_s: float = 0.7  # the way there and the hold
@@ -234,10 +221,9 @@ def _known(task: Task, who: Participant, folder: Path) -> tuple[RigCalibration, 
     rig, guided = about(task.rig), folder / "guided"
     model = HandModel.of(who.hand)
     scene = _scene(who, task, GuidedSubject(model, who.seed), model)
+    times = np.arange(task.guided) * (SUBJECT_S / task.guided)
     # The motion is slow: within a triple the hand is taken to stand still.
-    record_wrist(
-        guided, scene, poses_s=(np.arange(task.guided) * (SUBJECT_S / task.guided)).tolist(), step=task.step
-    )
+    record_wrist(guided, scene, poses_s=times.tolist(), step=task.step)
     _detect(guided, task.camera.name, rig, who.measured)
     cycles = list(recorded_cycles(guided, task.camera.name))
     try:
@@ -270,12 +256,10 @@ def _scene(who: Participant, task: Task, motion: Stations | GuidedSubject, model
 
 
 def _detect(folder: Path, camera: str, rig: RigCalibration, hand: HandProfile) -> None:
-    """Detect in a recording whose device and hand are believed to be these."""
+    """Detect in a recording taken for one of this device and hand."""
     save(folder / MANIFEST, replace(open_recording(folder).manifest, rig=rig))
     save(folder / "hand.json", hand)
-    target = folder / f"detections_{camera}.npz"
-    of = ("--name", camera, "--camera", f"replay:{folder}", "--hand", folder / "hand.json")
-    command("slave", "run", *of, "-o", target)
+    detect(folder, camera, folder / f"detections_{camera}.npz", "--hand", folder / "hand.json")
 
 
 def trials_of(done: Performed) -> list[Trial]:

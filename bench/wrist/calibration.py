@@ -1,9 +1,8 @@
 """Errors of the calibration of a wrist device against exact truth: its laser plane, palm and knuckles of the subject.
 
-Boards are rendered before the wrist camera, each seed another laser and other places of the board. People wear the
-device for the first time: their files are wrong in the pose of the palm (3 degrees and 2 mm per axis) and in the
-knuckles (5 mm per axis); the bones are those of a participant of the study, measured. Their detections are the
-simulated truth with noise, and one tip in twenty is none.
+Boards are rendered, each seed another laser and other places of the board. The files of people are wrong in the pose of
+the palm (3 degrees and 2 mm per axis) and in the knuckles (5 mm per axis); their detections are the simulated truth
+with noise, and one tip in twenty is none.
 """
 
 from collections.abc import Iterator
@@ -40,7 +39,7 @@ LASER_PX, TIP_PX = 0.4, 3.0
 class Person:
     """One who wears the device; same seed, same person."""
 
-    seed: int  # same seed, same person
+    seed: int
     camera: CameraCalibration  # of the device
     rig: RigCalibration  # as the files have it
     hand: HandProfile
@@ -91,19 +90,9 @@ class Person:
 def detections(camera: str, k: int, laser: Float, tip: Float) -> WristDetections:
     """Triple `k` with laser points and tips (5, 2) [px]."""
     unseen, none = np.isnan(laser[:, 0]), np.isnan(tip[:, 0])
-    return WristDetections(
-        camera=camera,
-        session=0,
-        seq=3 * k,
-        t_ns=k * 100_000_000,
-        ready_t_ns=k * 100_000_000,
-        laser_uv=laser,
-        laser_sigma_px=np.where(unseen, np.nan, LASER_PX),
-        laser_px=np.full(5, np.nan),
-        tip_uv=tip,
-        tip_sigma_px=np.where(none, np.nan, TIP_PX),
-        tip_depth=np.full(5, np.nan),
-    )
+    sigma, tip_sigma = np.where(unseen, np.nan, LASER_PX), np.where(none, np.nan, TIP_PX)
+    t_ns, nothing = k * 100_000_000, np.full(5, np.nan)
+    return WristDetections(camera, 0, 3 * k, t_ns, t_ns, laser, sigma, nothing, tip, tip_sigma, nothing)
 
 
 def knuckles(hand: HandProfile) -> Float:
@@ -160,7 +149,8 @@ def _planes(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:
 
 
 def _errors(name: str, found: list[tuple[PlaneFit, LaserPlane]], note: str) -> Iterator[Row]:
-    rotation = [_angle_deg(np.array(fit.plane.normal), np.array(true.normal)) for fit, true in found]
+    normals = [(np.array(fit.plane.normal), np.array(true.normal)) for fit, true in found]
+    rotation = [np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)) for a, b in normals]
     shift = [1e3 * abs(fit.plane.offset_m - true.offset_m) for fit, true in found]
     sigma_deg = np.median([np.degrees(fit.normal_sigma_rad) for fit, _ in found])
     sigma_mm = np.median([1e3 * fit.offset_sigma_m for fit, _ in found])
@@ -172,10 +162,8 @@ def _errors(name: str, found: list[tuple[PlaneFit, LaserPlane]], note: str) -> I
 
 def _subjects() -> Iterator[Row]:
     """Mounting and knuckles before and after a guided motion, and the PIP of a natural curl with the files of each."""
-    rotation: list[tuple[Float, Float]] = []
-    knuckle: list[tuple[Float, Float]] = []
-    unlikely: list[Float] = []
-    people: list[tuple[Person, Subject]] = []
+    rotation, knuckle = list[tuple[Float, Float]](), list[tuple[Float, Float]]()
+    unlikely, people = list[Float](), list[tuple[Person, Subject]]()
     for person in map(Person.of, _SEEDS):
         try:
             found = calibrate_subject(person.detected("subject")[0], person.rig, person.camera, person.hand)
@@ -197,10 +185,8 @@ def _subjects() -> Iterator[Row]:
     curled = 6  # people whose curl is solved, with three tables each
     errors = [_pip_errors(person, found) for person, found in people[:curled]]
     for k, name in enumerate(("files as they were", "calibrated", "true files")):
-        value = rms(np.concatenate([one[k] for one in errors]))
-        yield Row(
-            f"subject: PIP of a natural curl, {name}, rms", value, "deg", f"{len(errors)} people, to 90 deg"
-        )
+        value, note = rms(np.concatenate([one[k] for one in errors])), f"{len(errors)} people, to 90 deg"
+        yield Row(f"subject: PIP of a natural curl, {name}, rms", value, "deg", note)
 
 
 def _pip_errors(person: Person, found: Subject) -> list[Float]:
@@ -248,7 +234,3 @@ def _wrong_lens(camera: CameraCalibration, seed: int) -> CameraModel:
     fx, fy, cx, cy = lens.fx_px + focal, lens.fy_px + focal, lens.cx_px + u, lens.cy_px + v
     off = replace(lens, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy)
     return CameraModel.of(replace(camera, intrinsics=off), np.eye(4))
-
-
-def _angle_deg(a: Float, b: Float) -> float:
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))

@@ -91,7 +91,7 @@ def test_motion_smears_the_light_over_its_way() -> None:
         mean = (columns @ place) / columns.sum()
         return float((columns @ (place - mean) ** 2) / columns.sum())
 
-    # A box of width w has variance w^2 / 12; the instants are 24, spaced 0.25 px.
+    # A box of width w has variance w^2 / 12; the moments are 24, spaced 0.25 px.
     np.testing.assert_allclose(width(moving) - width(still), 6.0**2 / 12.0, rtol=0.01)
 
 

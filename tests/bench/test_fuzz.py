@@ -1,4 +1,4 @@
-"""What a hostile sender says: every field of every type is attacked, a new one by itself, and the decoder holds."""
+"""What a hostile sender sends: every field of every type is attacked, a new one by itself, and the decoder holds."""
 
 import random
 from collections import Counter

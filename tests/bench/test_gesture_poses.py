@@ -1,4 +1,4 @@
-"""The bench of poses counts what it says it counts."""
+"""The bench of poses counts what it should."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The benchmark of random hands: its draws are what it says, its ruler sees planted faults, and it runs."""
+"""The benchmark of random hands: its draws are what they should be, its ruler sees planted faults, and it runs."""
 
 from dataclasses import replace
 

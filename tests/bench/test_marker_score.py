@@ -44,7 +44,7 @@ def test_honest_sigmas_score_95_percent_and_one_and_boasts_do_not() -> None:
 
 
 class Displaced:
-    """A detector that is off by a third of a pixel: the judge must say so."""
+    """A detector that is off by a third of a pixel: the judge must see it."""
 
     def __init__(self, inner: MarkerDetector) -> None:
         self.inner = inner

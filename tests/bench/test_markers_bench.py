@@ -1,4 +1,4 @@
-"""The speed rows run what they say: frames to and fro, each step with its own place."""
+"""The speed rows run what they name: frames to and fro, each step with its own place."""
 
 from dataclasses import replace
 

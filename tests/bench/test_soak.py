@@ -1,4 +1,4 @@
-"""What a soak says of courses whose truth is known: a leak is found, noise is none, a loss is never hidden."""
+"""What a soak finds in courses whose truth is known: a leak is found, noise is none, a loss is never hidden."""
 
 import mmap
 import os
@@ -27,7 +27,7 @@ _EVERY_S, _HOUR_S = 5.0, 3600.0
 
 
 def minute(t_s: float, p50_ms: float = 20.0, **counts: int) -> Minute:
-    return Minute(t_s, 10.0, p50_ms, 3.0 * p50_ms, 1.0, {}, counts, {}, {})
+    return Minute(t_s, 10.0, p50_ms, 3.0 * p50_ms, 1.0, {}, counts, {})
 
 
 def history(
@@ -42,7 +42,7 @@ def history(
         minute(60.0 * k, 20.0 + grows_ms * k / 60.0 + rng.exponential(6.0), **counts)
         for k in range(1, round(length_s / 60.0) + 1)
     ]
-    reads = [Footprint(float(x), float(x), float(x), float(x), 0.0, 5, 9) for x in mb]
+    reads = [Footprint(float(x), float(x), 0.0) for x in mb]
     return SoakHistory(list(times), {"master": reads}, minutes)
 
 
@@ -106,7 +106,7 @@ def stepped(at_s: float, mb: float, length_s: float = 1200.0) -> SoakHistory:
     times = np.array(made.times_s)
     more = 0.5 * mb * ((times >= at_s).astype(float) + (times >= at_s + 5.0))
     mbs = np.array(made.series("master", "rss_mb")) + more
-    made.footprints["master"] = [Footprint(x, x, x, x, 0.0, 5, 9) for x in mbs.tolist()]
+    made.footprints["master"] = [Footprint(x, x, 0.0) for x in mbs.tolist()]
     return made
 
 
@@ -166,6 +166,4 @@ def test_memory_of_a_process_is_read_as_the_kernel_has_it() -> None:
     with fresh_pages(32_000_000):
         after = footprint(os.getpid())
     assert after.anonymous_mb - before.anonymous_mb == pytest.approx(32.0, abs=3.0)
-    assert after.uss_mb <= after.pss_mb <= after.rss_mb
-    assert after.threads >= 1
-    assert after.files >= 3
+    assert after.anonymous_mb <= after.rss_mb

@@ -1,4 +1,4 @@
-"""Who takes part is spread as the study says, and what is measured of a hand is off as calibrations are."""
+"""Who takes part is spread as the study has it, and what is measured of a hand is off as calibrations are."""
 
 from pathlib import Path
 
