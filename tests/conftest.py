@@ -26,13 +26,18 @@ settings.load_profile("house")
 LIVE = (
     "tests/loopback/",
     "tests/aarch64/",
-    "tests/docs/examples/",
+    "tests/docs/examples/test_subscriber.py",
+    "tests/docs/examples/test_volume_dial.py",
     "tests/master/console/",
     "tests/master/commands/test_installed_master.py",
     "tests/master/run/test_live",
     "tests/master/outputs/web/test_page.py",
     "tests/master/recording/export/test_export_gltf.py",
 )
+
+# In simulated time: any worker may have these.
+_SIMULATED = ("handshake", "hostile_solver", "million", "stolen", "twins", "vive_lines", "wrist_link")
+SIMULATED = tuple(f"tests/loopback/test_{name}.py" for name in _SIMULATED)
 
 # These solve hands of more free angles, whose kernels no other test needs: two workers would compile them twice.
 OTHER_HANDS = ("tests/master/estimator/", "tests/master/fabrik/test_any_input.py")
@@ -68,13 +73,19 @@ def pytest_configure(config: pytest.Config) -> None:
 BEHIND = 10  # niceness of the workers whose tests are not live
 
 
+def is_live(nodeid: str) -> bool:
+    """Whether a test is one of those that one worker has."""
+    return nodeid.startswith(LIVE) and not nodeid.startswith(SIMULATED)
+
+
 class LiveScheduling(LoadFileScheduling):
     """Each file goes to one worker whole, all that is live to the same one, and what compiles for other hands, too."""
 
     def _split_scope(self, nodeid: str) -> str:
-        for name, begins in (("live", LIVE), ("hands", OTHER_HANDS)):
-            if nodeid.startswith(begins):
-                return name
+        if is_live(nodeid):
+            return "live"
+        if nodeid.startswith(OTHER_HANDS):
+            return "hands"
         return super()._split_scope(nodeid)
 
     def mark_test_pending(self, item: str) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -88,13 +99,13 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LiveSch
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """What is live begins first: it lasts longest."""
-    items.sort(key=lambda item: not item.nodeid.startswith(LIVE))
+    items.sort(key=lambda item: not is_live(item.nodeid))
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Let what is live have the processor first: there are more workers than cores, and its clock runs on."""
-    if "PYTEST_XDIST_WORKER" in os.environ and not item.nodeid.startswith(LIVE) and os.nice(0) < BEHIND:
+    if "PYTEST_XDIST_WORKER" in os.environ and not is_live(item.nodeid) and os.nice(0) < BEHIND:
         os.nice(BEHIND)
 
 

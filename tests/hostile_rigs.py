@@ -39,7 +39,7 @@ class Rigs:
 def losing(rig: HostileRig) -> float:
     """Share of the honest poses that is lost now; 1 where the master does not answer."""
     end = rig.begin()
-    time.sleep(1.0)
+    time.sleep(0.5)
     phase = end()
     return 1.0 if rig.report(5.0) is None else phase.lost
 
@@ -63,7 +63,7 @@ def unharmed(rig: HostileRig) -> Generator[dict[str, int]]:
     rise: dict[str, int] = {}
     end, newest = rig.begin(), rig.newest
     yield rise
-    time.sleep(1.0)
+    time.sleep(0.5)
     assert until(lambda: rig.newest is not newest or not rig.alive()), "it reports no more"
     phase: Phase = end()
     assert rig.alive(), rig.log.read_text()[-2000:]

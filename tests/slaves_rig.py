@@ -34,6 +34,16 @@ class Lists:
         with self._lock:
             return self._came[-1][1] if self._came else frozenset()
 
+    def empty_since(self, began: float) -> float | None:
+        """Return since when the list has been empty, `began` if none came; None: it is not empty now."""
+        with self._lock:
+            since = None if self._came else began
+            for came, keys in reversed(self._came):
+                if keys:
+                    break
+                since = came
+            return since
+
     def since(self, moment: float) -> list[tuple[float, frozenset[Key]]]:
         """Return the lists that came after a moment of `time.monotonic`."""
         with self._lock:

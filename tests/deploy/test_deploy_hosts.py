@@ -86,6 +86,8 @@ def test_our_own_wheel_is_whole_and_always_the_same(tmp_path: Path, monkeypatch:
 def test_a_given_wheelhouse_gets_ours_and_a_release_is_named_by_all_of_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    ours = _file(tmp_path / "phalanx_hand-1.0-py3-none-any.whl", b"0")
+    monkeypatch.setattr(wheels_module, "own_wheel", lambda: ours)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     given, kind = tmp_path / "given", wheels_module.Kind("aarch64", "3.13")
     given.mkdir()

@@ -196,7 +196,7 @@ def test_the_start_waits_for_the_last_camera_or_for_its_timeout() -> None:
     assert late.start_t_ns < wires.clock.t_ns
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(6))
 def test_any_loss_pattern_of_20_percent_still_starts(seed: int) -> None:
     wires = Wires(loss=0.2, seed=seed)
     master = wires.new_master()

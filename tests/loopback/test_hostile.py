@@ -1,25 +1,38 @@
 """Whoever has a device's own key says what he likes to a real master: it goes on, and so do all others.
 
 One hand before two honest cameras; a third camera of it, a tracker, and a second hand's wrist device are stolen
-(`bench.rigs.hostile`). `python -m bench hostile` is the same with ten times as many messages.
+(`bench.rigs.hostile`). `python -m bench hostile` is the same with ten times as many messages. Then
+what a device reports on the bus, and what it asks there: nobody's terminal, report or master suffers.
 """
 
 import json
 import subprocess
 import sys
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from pathlib import Path
 from shutil import copytree
 
+import msgspec
 import numpy as np
 import pytest
+import zenoh
 from msgspec import Struct
 
 from bench.rigs.hostile import ROOT, STOLEN, HostileRig, Limits, all_attacked, row
+from bench.rigs.hostile_sender import raw_bus
 from bench.rigs.rooms import ROOM
 from common.link.handshake import EchoAnswer
-from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose, WristDetections
+from common.messages import (
+    Command,
+    Health,
+    ImuSample,
+    MarkerDetections,
+    TagDetections,
+    TrackerPose,
+    WristDetections,
+    encode,
+)
 from tests.hostile_rigs import (
     BOUNDS,
     LATE,
@@ -37,10 +50,11 @@ from tests.hostile_rigs import (
     stolen,
     unharmed,
 )
-from tests.network_helpers import until
+from tests.network_helpers import PATIENCE_S, until
 
 MESSAGES, PER_S = 20_000, 2500.0
-COUNTED_S = 3.0
+COUNTED_S, FLOOD_S = 3.0, 3.0
+OWNED = "pi\x1b]0;owned\x07\u202e"
 GENEROUS = Limits(
     lost=0.3, silent_s=20.0
 )  # of a machine that has other things to do; the bench holds its own
@@ -66,18 +80,19 @@ def test_twenty_thousand_hostile_messages_of_every_kind_cost_the_others_nothing(
     assert not any(one.broken for one in outcomes), shown
 
 
-@pytest.mark.parametrize("t2_ns", [MOST, LEAST, 0])
-def test_an_echo_that_nobody_asked_for_is_refused_and_ends_nothing(rig: HostileRig, t2_ns: int) -> None:
+def test_an_echo_that_nobody_asked_for_is_refused_and_ends_nothing(rig: HostileRig) -> None:
     with stolen(rig, "cam02") as sender, unharmed(rig) as rise:
-        time.sleep(0.3)  # good ones came before
-        for t1_ns in (LEAST, LEAST // 2, -1, 0, 1, MOST // 2, MOST):
-            sender.send_message(EchoAnswer, t1_ns=t1_ns, t2_ns=t2_ns, t3_ns=MOST)
-            sender.send_message(EchoAnswer, t1_ns=t1_ns // 4, t2_ns=t2_ns // 4, t3_ns=t2_ns // 4)
-        time.sleep(0.3)
-        for _ in range(10):
-            sender.send_message(MarkerDetections)
-    assert refused(rise, UNASKED) >= 5, rise
-    assert rise["cam02.received"] >= 5, "its clock is still known"
+        for t2_ns in (MOST, LEAST, 0):
+            before = refused(counts(rig), UNASKED)
+            time.sleep(0.3)  # good ones came before
+            for t1_ns in (LEAST, LEAST // 2, -1, 0, 1, MOST // 2, MOST):
+                sender.send_message(EchoAnswer, t1_ns=t1_ns, t2_ns=t2_ns, t3_ns=MOST)
+                sender.send_message(EchoAnswer, t1_ns=t1_ns // 4, t2_ns=t2_ns // 4, t3_ns=t2_ns // 4)
+            time.sleep(0.3)
+            for _ in range(10):
+                sender.send_message(MarkerDetections)
+            assert until(lambda least=before + 5: refused(counts(rig), UNASKED) >= least, COUNTED_S), t2_ns
+    assert rise["cam02.received"] >= 15, "its clock is still known"
 
 
 def test_a_slave_whose_rig_has_other_markers_is_refused_by_name_with_the_fix(
@@ -176,3 +191,68 @@ def test_numbers_that_cannot_be_are_refused_for_their_reason(rig: HostileRig, de
                 time.sleep(0.02)
             enough = until(lambda: refused(counts(rig), *reasons) >= before + 4, COUNTED_S)  # noqa: B023
             assert enough, f"{kind.__name__} {list(changes)}: none of {reasons} was counted: {counts(rig)}"
+
+
+def report(session: zenoh.Session, name: str, changes: Mapping[str, object]) -> None:
+    """Publish a report of a device with these fields, whatever the types say."""
+    whole = encode(Health(name, 1, time.monotonic_ns(), {"frames": 1}, {"rate_hz": 30.0}))
+    fields = msgspec.msgpack.decode(whole) | changes
+    session.put(f"phalanx/health/{name}", msgspec.msgpack.encode(fields))
+
+
+def test_what_a_device_says_of_itself_reaches_no_terminal(rig: HostileRig) -> None:
+    shown: list[bytes] = []
+    commands = (
+        ("-m", "master", "check"),
+        ("-m", "master", "fleet", "status", "--seconds", "1", "--json"),
+        ("-m", "master", "fleet", "status"),
+    )
+    with unharmed(rig), raw_bus(rig.endpoint) as session:
+        running = [
+            subprocess.Popen(
+                [sys.executable, *command, "--bus", rig.endpoint],
+                cwd=ROOT, env=rig.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            )
+            for command in commands
+        ]  # fmt: skip
+        while any(one.poll() is None for one in running):
+            for changes in (
+                {"host": OWNED, "version": OWNED},
+                {"metrics": {"temperature_c": 1e300}},
+                {"metrics": {OWNED: 1.0}},
+                {"counts": {"frames": 2**64 - 1}},
+                {"version": "9" * 64},
+            ):
+                report(session, "cam02", changes)
+            time.sleep(0.05)
+        shown += [one.communicate(timeout=PATIENCE_S)[0] for one in running]
+    assert any(b"cam02" in text for text in shown), shown
+    for text in (*shown, rig.log.read_bytes()):
+        assert b"Traceback" not in text, text
+        for sequence in ("\x1b]", "\x07", "\u202e"):
+            assert sequence.encode() not in text, text
+
+
+def test_a_device_that_reports_without_end_keeps_nobody_from_being_heard(rig: HostileRig) -> None:
+    body = encode(Health("cam02", 1, 1, {f"n{k}": k for k in range(500)}, {"rate_hz": 30.0}))
+    with unharmed(rig) as rise, raw_bus(rig.endpoint) as session:
+        ended = time.monotonic() + FLOOD_S
+        while time.monotonic() < ended:
+            session.put("phalanx/health/cam02", body, congestion_control=zenoh.CongestionControl.BLOCK)
+        report(session, "cam00", {"version": "heard"})
+        code, output = rig.command("fleet", "status", "--seconds", "1", "--json")
+    assert rise["bus.dropped"] > 0, rise
+    assert code == 0, output
+
+
+def test_commands_that_are_not_for_the_master_or_none_at_all_are_refused(rig: HostileRig) -> None:
+    key, none = "phalanx/command/master", encode(Command("master", "no-such-verb"))
+    with unharmed(rig), raw_bus(rig.endpoint) as session:
+        for verb in ("stop", "report"):
+            replies = list(session.get(key, payload=encode(Command("left", verb)), timeout=5.0))
+            assert replies, verb
+            assert all(reply.ok is None for reply in replies), verb
+            assert all(reply.err is not None and b"left" in reply.err.payload.to_bytes() for reply in replies)
+        for payload in (b"", b"\xc1", b"\x91" * 10_000, none):
+            assert all(one.ok is None for one in session.get(key, payload=payload, timeout=5.0)), payload[:20]
+    assert counts(rig)["poses"] > 0

@@ -183,8 +183,7 @@ def test_it_waits_for_a_master_and_a_signal_ends_it(tmp_path: Path) -> None:
     assert "0 samples, sent 0" in log.read_text()
 
 
-@pytest.mark.parametrize("line", ["T,{},1e300", "B,{},1e300,1e300,2", "T,{},nan"])
-def test_a_number_that_no_report_can_carry_does_not_silence_it(tmp_path: Path, line: str) -> None:
+def test_a_number_that_no_report_can_carry_does_not_silence_it(tmp_path: Path) -> None:
     """What a broken sensor says of its temperature is its own text."""
     files, log, link = calibration(tmp_path), tmp_path / "imu.log", tmp_path / "ttyACM0"
     key, port, endpoint = new_key(), free_udp_port(), free_endpoint()
@@ -196,8 +195,10 @@ def test_a_number_that_no_report_can_carry_does_not_silence_it(tmp_path: Path, l
         got: list[ImuSample] = []
         assert until(lambda: take(ingest, got) >= 10), log.read_text()
         assert until(lambda: "palm-imu" in bus.alive()), log.read_text()
-        device.write(line.format(device.now_us).encode() + b"\r\n")
         reports = bus.subscribe("health", "palm-imu")
-        for _ in range(3):  # what it measured is in one of the next two
-            assert until(lambda: take(ingest, got) >= 10)
-            assert isinstance(reports.get(PATIENCE_S), Health), "undecodable"
+        for line in ("T,{},1e300", "B,{},1e300,1e300,2", "T,{},nan"):
+            device.write(line.format(device.now_us).encode() + b"\r\n")
+            for _ in range(2):  # what it measured is in one of the next two
+                least = len(got) + 10
+                assert until(lambda n=least: take(ingest, got) >= n)
+                assert isinstance(reports.get(PATIENCE_S), Health), line

@@ -116,15 +116,15 @@ def test_a_clean_network_loses_nothing(rig: Rig) -> None:
     assert all(uplink.wait_for_start(PATIENCE_S) for uplink in slaves.values())
     assert until(lambda: ingest.connected == {"left", "right"})
     assert slaves["left"].zenoh_endpoint == "tcp/127.0.0.1:1"
-    got, errors = stream(rig, slaves, ingest, 1.0, whole=True)
-    assert got == {"left": 100, "right": 100}
+    got, errors = stream(rig, slaves, ingest, 0.5, whole=True)
+    assert got == {"left": 50, "right": 50}
     assert max(errors) < 1.0
     last, estimate = between_echoes(rig, slaves["right"], ingest)
     assert last.t_sigma_ns == pytest.approx(estimate.sigma_at(last.t_ns), rel=1e-6)  # their stamps are exact
     assert ingest.counts["right.clock_steps"] == 0
     assert ingest.lost == 0
     assert not ingest.refused
-    assert slaves["left"].counts["sent"] == 100
+    assert slaves["left"].counts["sent"] == 50
 
 
 def between_echoes(rig: Rig, uplink: Uplink, ingest: Ingest) -> tuple[MarkerDetections, ClockEstimate]:
@@ -166,9 +166,8 @@ def test_twenty_percent_loss_jitter_duplicates_and_reordering(rig: Rig) -> None:
     assert set(ingest.refused) <= {"duplicate", "replayed", "stale"}
 
 
-@pytest.mark.parametrize("impairment", [Impairment(), BAD], ids=["clean", "bad"])
-def test_either_side_may_die_and_the_others_go_on(rig: Rig, impairment: Impairment) -> None:
-    rig.through(impairment, seed=5)
+def test_either_side_may_die_and_the_others_go_on(rig: Rig) -> None:
+    rig.through(BAD, seed=5)
     slaves = {name: rig.slave(name) for name in ("left", "right")}
     ingest = rig.master()
     assert until(all_started(slaves))

@@ -1,4 +1,4 @@
-"""One million random and mutated datagrams into both ends of the link: no crash, no growth, no effect."""
+"""Hostile datagrams by the hundred thousand into both ends of the link: no crash, no growth, no effect."""
 
 import gc
 import random
@@ -15,7 +15,8 @@ from slave.link import SlaveLink
 from tests.loopback.test_handshake import KEY, MASTER, Wires, started_pair
 from tests.network_helpers import detections
 
-BATCH = 20_000
+BATCH = 10_000
+TOTAL = 200_000
 SOURCE = ("6.6.6.6", 6)
 
 
@@ -79,7 +80,7 @@ def wires() -> Wires:
     return Wires()
 
 
-def test_a_million_datagrams(wires: Wires) -> None:
+def test_random_and_mutated_datagrams(wires: Wires) -> None:
     source = random.Random(2024)
     master, left, _ = started_pair(wires)
     wires.run(3.0)
@@ -111,9 +112,9 @@ def test_a_million_datagrams(wires: Wires) -> None:
     gc.collect()
     after = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
-    assert after - before < 50_000  # bytes in 40 000 datagrams: nothing is kept
+    assert after - before < 25_000  # bytes in 20 000 datagrams: nothing is kept
     objects = len(gc.get_objects())
-    while total < 1_000_000:
+    while total < TOTAL:
         total += batch()
     gc.collect()
     assert len(gc.get_objects()) - objects < 500
@@ -146,7 +147,7 @@ def test_sealed_rubbish_of_a_slave_gone_mad(wires: Wires) -> None:
     assert session is not None
     whole = encode(detections("left", left.process, 0))
     kinds = (Kind.DATA, Kind.DATA, Kind.ECHO_ANSWER, Kind.STARTED)
-    for i in range(50_000):
+    for i in range(10_000):
         body = bytearray(whole)
         if i % 2:
             body = bytearray(source.randbytes(source.randrange(120)))
@@ -155,7 +156,7 @@ def test_sealed_rubbish_of_a_slave_gone_mad(wires: Wires) -> None:
                 body[source.randrange(len(body))] = source.randrange(256)
         datagram = session.sealer.seal(kinds[i % 4], bytes(body))
         master.receive(datagram, MASTER, wires.clock.now_ns())
-    assert master.refused[Refusal.UNDECODABLE] > 20_000
+    assert master.refused[Refusal.UNDECODABLE] > 4_000
     assert set(master.refused) <= {
         Refusal.UNDECODABLE,
         Refusal.IMPOSTOR,

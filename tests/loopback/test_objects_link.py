@@ -11,7 +11,7 @@ import pytest
 from common.clock import SkewedClock, SystemClock
 from common.link.datagram import Kind, Refusal, Sealer
 from common.link.handshake import RigKeys
-from common.messages import MarkerDetections, TagDetections, TrackerPose, WristDetections, encode
+from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose, encode
 from master.run.ingest import CAPACITY, Ingest
 from master.run.link import MasterLink
 from slave.link import SlaveLink
@@ -92,7 +92,7 @@ def test_a_lost_tag_is_no_lost_frame_where_the_camera_skipped_one() -> None:
     assert (counts.received, counts.lost, counts.skipped) == (95, 2, 3)
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(3))
 def test_any_order_and_loss_of_both_kinds_is_accounted_for(seed: int) -> None:
     wires, chance = Wires(seed=seed), random.Random(seed)
     master, left, _, _ = started(wires)
@@ -147,27 +147,23 @@ def test_late_and_repeated_ones_are_dropped_and_counted() -> None:
     assert master.refused == {Refusal.DUPLICATE: 2}
 
 
-@pytest.mark.parametrize(
-    ("who", "message"),
-    [
-        ("left", tags("right", 1, 0)),  # in the name of another camera
-        ("left", tracker("left", 1, 0)),
-        ("left", tracker("puck", 1, 0)),
-        ("wrist", tags("wrist", 1, 0)),  # the camera of a wrist device sees no tags
-        ("puck", tags("left", 1, 0)),
-        ("puck", tags("puck", 1, 0)),
-        ("puck", detections("puck", 1, 0)),
-        ("puck", sample("puck", 1, 0)),
-        ("puck", tracker("another", 1, 0)),
-    ],
-)
-def test_who_sends_what_another_kind_of_sender_sends_is_an_impostor(
-    who: str, message: MarkerDetections | TagDetections | TrackerPose | WristDetections
-) -> None:
+def test_who_sends_what_another_kind_of_sender_sends_is_an_impostor() -> None:
     wires = Wires()
     master, left, wrist, puck = started(wires)
-    wires.send({"left": left, "wrist": wrist, "puck": puck}[who], message)
-    assert master.refused == {Refusal.IMPOSTOR: 1}
+    cases: list[tuple[SlaveLink, MarkerDetections | TagDetections | TrackerPose | ImuSample]] = [
+        (left, tags("right", 1, 0)),  # in the name of another camera
+        (left, tracker("left", 1, 0)),
+        (left, tracker("puck", 1, 0)),
+        (wrist, tags("wrist", 1, 0)),  # the camera of a wrist device sees no tags
+        (puck, tags("left", 1, 0)),
+        (puck, tags("puck", 1, 0)),
+        (puck, detections("puck", 1, 0)),
+        (puck, sample("puck", 1, 0)),
+        (puck, tracker("another", 1, 0)),
+    ]
+    for number, (sender, message) in enumerate(cases, 1):
+        wires.send(sender, message)
+        assert master.refused == {Refusal.IMPOSTOR: number}, message
     assert [*wires.got, *wires.tags, *wires.tracked, *wires.samples] == []
     wires.send(left, tags("left", left.process, 0))
     wires.send(wrist, cycle("wrist", wrist.process, 1))

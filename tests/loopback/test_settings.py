@@ -8,9 +8,12 @@ from pathlib import Path
 from shutil import copytree
 
 import msgspec
+import pytest
 
 from common.bus.keys import new_key
 from common.calibration import CameraCalibration, load, save
+from common.errors import BusError
+from tests.cli import Ended, invoke
 from tests.network_helpers import PATIENCE_S, free_endpoint, free_udp_port, until
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -51,20 +54,27 @@ class Rig:
     def shown(self, *options: str) -> dict[str, tuple[str, ...]]:
         """Setting -> wanted and read back, of a command that must succeed."""
         done = self.camera(*options)
-        assert done.returncode == 0, done.stderr
-        return {line.split()[0]: tuple(line.split()[1:]) for line in done.stdout.splitlines()}
+        assert done.exit_code == 0, done.output
+        return {line.split()[0]: tuple(line.split()[1:]) for line in done.output.splitlines()}
 
-    def camera(self, *options: str) -> subprocess.CompletedProcess[str]:
-        """`phalanx camera …` as a person types it; once more where a busy master did not answer at once."""
-        command = [PYTHON, "-m", "master", "camera", *options, "--bus", self.endpoint]
-        tries: list[subprocess.CompletedProcess[str]] = []
+    def camera(self, *options: str) -> Ended:
+        """`phalanx camera …`; once more where a busy master did not answer at once.
+
+        Raises:
+            BusError: What it refuses.
+        """
+        ended: list[Ended] = []
 
         def answered() -> bool:
-            tries.append(subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False))
-            return "cannot open the bus" not in tries[-1].stderr
+            try:
+                ended.append(invoke("camera", *options, "--bus", self.endpoint))
+            except BusError as error:
+                if "cannot open the bus" not in str(error):
+                    raise
+            return bool(ended)
 
-        assert until(answered), tries[-1].stderr
-        return tries[-1]
+        assert until(answered), "the bus cannot be opened"
+        return ended[-1]
 
 
 @contextmanager
@@ -98,12 +108,12 @@ def test_a_camera_is_set_by_command_and_by_file_while_everything_runs(tmp_path: 
         assert desk.output("slave", "changed, but not used")
         assert desk.output("master", "changed files are not used")
 
-        refused = desk.camera("left", "--exposure-us", "90000")
-        assert refused.returncode == 1
-        assert "'left' refused 'set': exposure_us: wanted 90000, a frame at 60 Hz" in refused.stderr
+        with pytest.raises(
+            BusError, match="'left' refused 'set': exposure_us: wanted 90000, a frame at 60 Hz"
+        ):
+            desk.camera("left", "--exposure-us", "90000")
         assert desk.shown("left")["exposure_us"] == ("6000", "6000")
-        absent = desk.camera("cellar")
-        assert absent.returncode == 1
-        assert "no camera 'cellar' is on the bus; there are: left" in absent.stderr
+        with pytest.raises(BusError, match="no camera 'cellar' is on the bus; there are: left"):
+            desk.camera("cellar")
     for log in desk.logs.values():
         assert "Traceback" not in log.read_text()

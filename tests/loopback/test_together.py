@@ -43,11 +43,11 @@ def test_the_grab_test_runs_scores_and_outlives_its_wrist_device(tmp_path: Path)
         received.append(line)
         pids = pids or {name: int(pid) for name, pid in re.findall(r"(\w+) \(pid (\d+)\)", line)}
         run_s = int(found[1]) if (found := re.search(r"(\d+) of 180 s ", line)) else 0
-        if run_s >= 14 and not killed_ns and count_poses(tmp_path) > ENOUGH:
+        if run_s >= 6 and not killed_ns and count_poses(tmp_path) > ENOUGH:
             listening = listeners(demo.pid)
             killed_ns, before = time.monotonic_ns(), count_poses(tmp_path)
             os.kill(pids["wrist"], signal.SIGKILL)
-        if killed_ns and not ended and run_s >= 24 and count_poses(tmp_path) > before + ENOUGH:
+        if killed_ns and not ended and run_s >= 12 and count_poses(tmp_path) > before + ENOUGH:
             ended = True
             demo.send_signal(signal.SIGINT)
     output = "".join(received)

@@ -7,13 +7,13 @@ from contextlib import ExitStack
 import pytest
 
 from common.clock import SkewedClock, SystemClock
-from common.link.datagram import Kind, Refusal
-from common.messages import Detections, WristDetections, encode
+from common.link.datagram import Refusal
+from common.messages import Detections, ImuSample, WristDetections
 from master.run.ingest import Ingest
 from master.run.link import MasterLink
 from slave.link import SlaveLink
 from slave.uplink import Uplink
-from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Wires
+from tests.loopback.test_handshake import BROADCAST, KEY, S, Wires
 from tests.loopback.test_imu_link import sample
 from tests.network_helpers import PATIENCE_S, cycle, detections, free_udp_port, seeded, until
 
@@ -44,25 +44,20 @@ def test_its_triples_come_on_the_masters_clock_with_the_uncertainty_of_the_conve
     assert not master.refused
 
 
-@pytest.mark.parametrize(
-    ("wrist_says", "message"),
-    [
-        (True, detections("wrist", 1, 0)),  # markers of a camera that has none
-        (True, cycle("left", 1, 0)),
-        (True, sample("wrist", 1, 0)),
-        (False, cycle("left", 1, 0)),  # a triple of a camera without strobes
-        (False, cycle("wrist", 1, 0)),
-        (False, detections("wrist", 1, 0)),
-    ],
-)
-def test_who_sends_what_another_kind_of_camera_sends_is_an_impostor(
-    wrist_says: bool, message: Detections
-) -> None:
+def test_who_sends_what_another_kind_of_camera_sends_is_an_impostor() -> None:
     wires = Wires()
     master, left, wrist = started(wires)
-    sender = wrist if wrist_says else left
-    wires.send(sender, message)
-    assert master.refused == {Refusal.IMPOSTOR: 1}
+    cases: list[tuple[SlaveLink, Detections | ImuSample]] = [
+        (wrist, detections("wrist", 1, 0)),  # markers of a camera that has none
+        (wrist, cycle("left", 1, 0)),
+        (wrist, sample("wrist", 1, 0)),
+        (left, cycle("left", 1, 0)),  # a triple of a camera without strobes
+        (left, cycle("wrist", 1, 0)),
+        (left, detections("wrist", 1, 0)),
+    ]
+    for number, (sender, message) in enumerate(cases, 1):
+        wires.send(sender, message)
+        assert master.refused == {Refusal.IMPOSTOR: number}, message
     assert not wires.got
     wires.send(left, detections("left", left.process, 0))  # and the true ones are heard as before
     wires.send(wrist, cycle("wrist", wrist.process, 1))
@@ -95,7 +90,7 @@ def test_triples_lost_on_the_way_and_never_sent_are_distinguished() -> None:
     assert (counts.received, counts.lost, counts.skipped) == (53, 4, 3)
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(3))
 def test_any_loss_is_accounted_for_in_cycles(seed: int) -> None:
     wires, chance = Wires(seed=seed), random.Random(seed)
     master, _, wrist = started(wires)
@@ -112,32 +107,6 @@ def test_any_loss_is_accounted_for_in_cycles(seed: int) -> None:
     assert counts.received == len(kept)
     assert counts.skipped == 0
     assert counts.received + counts.lost == span
-
-
-def test_mutated_cycles_are_counted_and_have_no_effect() -> None:
-    wires, chance = Wires(), random.Random(5)
-    master, _, wrist = started(wires)
-    session = wrist._session
-    assert session is not None
-    body = encode(cycle("wrist", wrist.process, 1))
-    for _ in range(3000):  # sealed rightly: whoever has the session may send what he likes
-        broken = bytearray(body)
-        for _ in range(chance.randint(1, 3)):
-            at = chance.randrange(len(broken))
-            if chance.random() < 0.5:
-                broken[at] ^= 1 << chance.randrange(8)
-            else:
-                del broken[at : at + chance.randint(1, 8)]
-        wires.carry(session.sealer.seal(Kind.DATA, bytes(broken)), ("10.0.1.9", 5), MASTER, keep=False)
-    assert set(master.refused) <= {
-        *(Refusal.UNDECODABLE, Refusal.IMPOSTOR, Refusal.OUT_OF_BOUNDS, Refusal.FOREIGN_SESSION),
-        *(Refusal.SEQUENCE, Refusal.READY_TIME),
-    }
-    assert sum(master.refused.values()) > 2000
-    assert not master.quarantine.faults
-    for message in wires.got:  # what came through is a message, only with another number in it
-        assert isinstance(message, WristDetections)
-        assert message.camera == "wrist"
 
 
 def test_a_wrists_camera_is_one_of_the_cameras() -> None:

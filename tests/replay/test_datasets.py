@@ -1,14 +1,9 @@
-"""The whole offline line on rendered recordings with exact truth: colours, detection, solving, by command line.
+"""The whole offline line on rendered recordings with exact truth: colours, detection, solving, by its commands.
 
 The bars are those the project has set itself: no wrong blob, 95 % of half-visible markers found, caps within 4 mm,
 joints within 8 mm, the same bytes on every run.
 """
 
-import json
-import shutil
-import subprocess
-import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,67 +11,23 @@ import pytest
 
 from common.arrays import Bool, Float
 from master.outputs.poses import Poses
+from tests.replay.replayed import Replay, colours_of, command, replay
 
 HANDS = ("calib_colors", "static", "flex90", "poses_left", "translate_8ms", "lights_0_warm")
 SWEEPS = ("sweep_paper", "sweep_rough")
 
 
-@dataclass(frozen=True)
-class Replay:
-    """One replayed recording: its folder, where the results are, and how many frames it is truth for."""
-
-    recording: Path
-    out: Path
-
-    @property
-    def summary(self) -> dict[str, float]:
-        return json.loads((self.out / "summary.json").read_text())
-
-    def truth(self) -> dict[str, Float]:
-        with np.load(self.recording / "truth.npz") as file:
-            return {name: file[name] for name in file.files}
-
-    def detections(self, camera: str) -> dict[str, Float]:
-        with np.load(self.out / f"detections_{camera}.npz") as file:
-            return {name: file[name] for name in file.files}
-
-
-def command(root: Path, *arguments: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", *arguments], cwd=root, capture_output=True, text=True, timeout=120, check=False
-    )
-    assert done.returncode == 0, f"{' '.join(arguments)}\n{done.stdout}{done.stderr}"
-
-
-@pytest.fixture(scope="session")
-def calibration(datasets: Path, root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="module")
+def calibration(datasets: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A calib_json tree: colours learnt from the clicks of calib_colors, hands of the data sets."""
-    recordings = datasets / "stereo"
-    if not (recordings / "calib_colors").is_dir():
-        pytest.skip(f"no rendered stereo recordings at {recordings}")
-    tree = tmp_path_factory.mktemp("calib_json")
-    (tree / "cameras").mkdir()
-    shutil.copytree(datasets / "hands", tree / "hands")
-    for camera in ("left", "right"):
-        output = str(tree / "cameras" / f"{camera}.json")
-        command(root, "slave", "colours", str(recordings / "calib_colors"), "--camera", camera, "-o", output)
-    return tree
+    return colours_of(datasets, tmp_path_factory.mktemp("calib_json"))
 
 
-@pytest.fixture(scope="session")
-def replays(
-    datasets: Path, root: Path, calibration: Path, tmp_path_factory: pytest.TempPathFactory
-) -> dict[str, Replay]:
+@pytest.fixture(scope="module")
+def replays(datasets: Path, calibration: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Replay]:
     """Every recording of the set, replayed once."""
-    done: dict[str, Replay] = {}
-    for name in (*HANDS, *SWEEPS):
-        done[name] = replay(root, calibration, datasets / "stereo" / name, tmp_path_factory.mktemp(name))
-    return done
-
-
-def replay(root: Path, calibration: Path, recording: Path, out: Path) -> Replay:
-    command(root, "master", "replay", str(recording), "--calibration", str(calibration), "--out", str(out))
-    return Replay(recording, out)
+    stereo, given = datasets / "stereo", ("--calibration", calibration)
+    return {name: replay(stereo / name, tmp_path_factory.mktemp(name), *given) for name in (*HANDS, *SWEEPS)}
 
 
 def seen_and_true(replayed: Replay) -> tuple[Float, Float, Float, Float]:
@@ -169,12 +120,13 @@ def test_a_pose_for_every_frame_of_the_reference_camera(replays: dict[str, Repla
     np.testing.assert_array_equal(poses.valid.all(axis=1), model_ok)
 
 
-def test_two_runs_write_the_same_bytes(
+def test_a_process_of_its_own_writes_the_same_bytes(
     replays: dict[str, Replay], root: Path, calibration: Path, tmp_path: Path
 ) -> None:
     first = replays["translate_8ms"]
-    again = replay(root, calibration, first.recording, tmp_path)
+    options = ("--calibration", calibration, "--out", tmp_path)
+    command(root, "master", "replay", first.recording, *options)
     names = sorted(path.name for path in first.out.glob("*.npz"))
     assert names == ["detections_left.npz", "detections_right.npz", "poses.npz"]
     for name in names:
-        assert (first.out / name).read_bytes() == (again.out / name).read_bytes(), name
+        assert (first.out / name).read_bytes() == (tmp_path / name).read_bytes(), name

@@ -1,13 +1,10 @@
-"""The published session on rendered recordings, by command line: colours, detection, depth, verification.
+"""The published session on rendered recordings, by its commands: colours, detection, depth, verification.
 
 Bars: the power law of the rig with the published constants within 1 % of them and of every distance on average; the
 full stereo model on misaligned, distorted cameras within 0.5 % on average and 1.2 % at most.
 """
 
 import json
-import shutil
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,24 +14,21 @@ import numpy as np
 import pytest
 
 from common.calibration import RigCalibration, load
+from common.errors import PhalanxError
 from common.recording.frame_recording import open_recording
 from master.outputs.poses import Poses
 from master.replay.offline import solve
 from master.rig.setup import RigSetup, load_hand
+from tests.cli import calibrate
+from tests.replay.replayed import colours_of, detect
 
 CAMERAS = ("left", "right")
-
-
-def run(root: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", *map(str, arguments)]
-    return subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=120, check=False)
 
 
 @dataclass(frozen=True)
 class Sweep:
     """A recording, its detections, and a tree with the colours they were made with."""
 
-    root: Path
     recording: Path
     found: Path
     tree: Path
@@ -42,41 +36,19 @@ class Sweep:
     def calibrate(self, verb: str, *options: object) -> Any:
         """The numbers of `calibrate depth` or `verify`."""
         numbers = self.found / f"{verb}.json"
-        arguments = (verb, self.recording, "--detections", self.found, *options, "--json", numbers)
-        done = run(self.root, "master", "calibrate", *arguments)
-        assert done.returncode == 0, done.stderr
+        calibrate(verb, self.recording, "--detections", self.found, *options, "--json", numbers)
         return json.loads(numbers.read_text())
 
 
 @pytest.fixture(scope="module")
-def sweeps(datasets: Path, root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Sweep]:
+def sweeps(datasets: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Sweep]:
     """Both sweeps with detections."""
-    recordings = datasets / "stereo"
-    if not (recordings / "calib_colors").is_dir():
-        pytest.skip(f"no rendered stereo recordings at {recordings}")
-    colours = tmp_path_factory.mktemp("colours")
-    for camera in CAMERAS:
-        target = colours / "cameras" / f"{camera}.json"
-        done = run(root, "slave", "colours", recordings / "calib_colors", "--camera", camera, "-o", target)
-        assert done.returncode == 0, done.stderr
     out: dict[str, Sweep] = {}
     for name in ("sweep_paper", "sweep_rough"):
-        out[name] = Sweep(
-            root, recordings / name, tmp_path_factory.mktemp(name), tmp_path_factory.mktemp("tree")
-        )
-        shutil.copytree(colours / "cameras", out[name].tree / "cameras")
+        tree = colours_of(datasets, tmp_path_factory.mktemp("tree"))
+        out[name] = Sweep(datasets / "stereo" / name, tmp_path_factory.mktemp(name), tree)
         for camera in CAMERAS:
-            arguments = (
-                "--name",
-                camera,
-                "--camera",
-                f"replay:{recordings / name}",
-                "--calibration",
-                colours,
-            )
-            target = out[name].found / f"detections_{camera}.npz"
-            done = run(root, "slave", "run", *arguments, "-o", target)
-            assert done.returncode == 0, done.stderr
+            detect(out[name].recording, camera, out[name].found, "--calibration", tree)
     return out
 
 
@@ -146,9 +118,7 @@ def test_the_size_of_the_target_alone_corrects_most_of_the_lens(sweeps: dict[str
 
 def test_without_detections_the_command_says_how_to_make_them(sweeps: dict[str, Sweep]) -> None:
     recording = sweeps["sweep_paper"].recording
-    done = run(sweeps["sweep_paper"].root, "master", "calibrate", "depth", recording)
-    assert done.returncode == 1
-    assert (
-        f"phalanx-slave run --name right --camera replay:{recording} -o DIR/detections_right.npz"
-        in done.stderr
-    )
+    with pytest.raises(PhalanxError) as refused:
+        calibrate("depth", recording)
+    fix = f"phalanx-slave run --name right --camera replay:{recording} -o DIR/detections_right.npz"
+    assert fix in str(refused.value)

@@ -27,8 +27,7 @@ from master.commands.summary import read_summary
 from master.outputs.poses import Poses
 from master.replay.offline import solve
 from master.rig.setup import RigSetup, load_setup
-from slave.commands.offline import detect_recording, save_detections
-from tests.replay.test_datasets import command
+from tests.replay.replayed import detect, replay
 
 SECONDS, RATE_HZ = 1.0, 30.0
 STARTS_S = {41: 3.0, 42: 16.0, 43: 47.0}  # scene seed -> first moment: three different acts
@@ -75,8 +74,7 @@ def recorded(root: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Recor
         scene = Scene.standard(setup.rig, cameras, setup.hand.profile, seed)
         record_scene(folder / "recording", scene, SECONDS, start_s, imu=True)
         for camera in setup.rig.cameras:
-            found = detect_recording(folder / "recording", camera)
-            save_detections(folder / f"detections_{camera}.npz", found)
+            detect(folder / "recording", camera, folder)
         made.append(Recorded(folder / "recording", folder, setup))
     return made
 
@@ -141,16 +139,7 @@ def test_replay_by_command_uses_the_imu_of_the_recording(
     recorded: list[Recorded], root: Path, tmp_path: Path
 ) -> None:
     one = recorded[0]
-    command(
-        root,
-        "master",
-        "replay",
-        str(one.folder),
-        "--calibration",
-        str(root / "calib_json"),
-        "--out",
-        str(tmp_path / "a"),
-    )
+    replay(one.folder, tmp_path / "a", "--calibration", root / "calib_json")
     summary = read_summary(tmp_path / "a" / "summary.json")
     counts = msgspec.convert(summary["counts"], dict[str, int])
     assert counts["orientation.used"] == counts["poses"] == round(SECONDS * RATE_HZ)

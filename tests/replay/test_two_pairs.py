@@ -18,14 +18,14 @@ from master.commands.summary import read_summary
 from master.outputs.poses import Poses
 from master.replay.offline import solve
 from master.rig.setup import RigSetup, load_setup
-from tests.replay.test_datasets import command
+from tests.replay.replayed import replay
 
 SECONDS, RATE_HZ, SEED = 1.0, 30.0, 7
 
 
 @dataclass(frozen=True)
 class Replayed:
-    """A recorded scene, its results by command, and its setup."""
+    """A recorded scene, its results, and its setup."""
 
     folder: Path
     out: Path
@@ -44,16 +44,7 @@ def pointing(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Replayed:
     order = StudyPoses(HandModel.of(profile), view_centre(setup.rig), SEED).order
     start_s = order.index("pointing") * STATION_S + MOVE_S
     record_scene(folder / "recording", scene, SECONDS, start_s)
-    command(
-        root,
-        "master",
-        "replay",
-        str(folder / "recording"),
-        "--calibration",
-        str(tree),
-        "--out",
-        str(folder / "out"),
-    )
+    replay(folder / "recording", folder / "out", "--calibration", tree)
     return Replayed(folder / "recording", folder / "out", setup)
 
 

@@ -2,9 +2,6 @@
 
 import csv
 import json
-import shutil
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +13,8 @@ import pytest
 from common.arrays import Float
 from common.calibration import CameraCalibration, load, save
 from common.recording.pictures import decode
+from tests.conftest import ROOT
+from tests.replay.replayed import colours_of, command
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,9 @@ class Take:
         """Markers (T, M, 3) [m] that a replay of the videos finds, unfiltered; what it printed."""
         videos = [str(self.folder / f"{camera}.avi") for camera in ("left", "right")]
         tree, out = str(self.folder / "calib"), self.folder / "out"
-        output = command("master", "replay", *videos, "--calibration", tree, "--out", str(out), *options)
+        output = command(
+            ROOT, "master", "replay", *videos, "--calibration", tree, "--out", str(out), *options
+        )
         with np.load(out / "poses.npz") as poses:
             return poses["markers_raw_m"], output
 
@@ -40,14 +41,6 @@ class Take:
         return 1e3 * float(np.nanmedian(np.linalg.norm(markers - true, axis=-1)))
 
 
-def command(*arguments: str) -> str:
-    done = subprocess.run(
-        [sys.executable, "-m", *arguments], capture_output=True, text=True, timeout=300, check=False
-    )
-    assert done.returncode == 0, f"{' '.join(arguments)}\n{done.stdout}{done.stderr}"
-    return done.stdout
-
-
 @pytest.fixture(scope="module")
 def take(datasets: Path, tmp_path_factory: pytest.TempPathFactory) -> Take:
     """`translate_8ms`: 1 m/s at most, the right camera 8 ms late, rolling shutters; as MJPEG at 30 Hz."""
@@ -55,9 +48,8 @@ def take(datasets: Path, tmp_path_factory: pytest.TempPathFactory) -> Take:
     if not recording.is_dir():
         pytest.skip(f"no rendered stereo recordings at {recording.parent}")
     folder = tmp_path_factory.mktemp("take")
-    tree, clicked = folder / "calib", recording.parent / "calib_colors"
-    (tree / "rigs").mkdir(parents=True)
-    shutil.copytree(datasets / "hands", tree / "hands")
+    tree = colours_of(datasets, folder / "calib")
+    (tree / "rigs").mkdir()
     manifest = json.loads((recording / "recording.json").read_text())
     (tree / "rigs" / "desk.json").write_text(json.dumps(manifest["rig"]))
     times = ["camera,frame,time"]
@@ -65,7 +57,6 @@ def take(datasets: Path, tmp_path_factory: pytest.TempPathFactory) -> Take:
         rows = list(csv.DictReader(table))
     for camera, content in manifest["cameras"].items():
         file = tree / "cameras" / f"{camera}.json"
-        command("slave", "colours", str(clicked), "--camera", camera, "-o", str(file))
         markers = load(file, CameraCalibration).markers
         save(file, msgspec.structs.replace(msgspec.convert(content, CameraCalibration), markers=markers))
         writer = cv2.VideoWriter(

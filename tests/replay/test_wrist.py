@@ -1,4 +1,4 @@
-"""The whole offline line on rendered recordings of the wrist camera with exact truth, by command line.
+"""The whole offline line on rendered recordings of the wrist camera with exact truth, by its commands.
 
 The bars are those the project has set itself: laser points within 0.6 mm (median), on the right finger for 95 % of
 those with at least 2 mm of line in sight; 90 % of the visible fingertips within 6 px, at most 5 % of those reported
@@ -6,20 +6,20 @@ none; of natural flexion the PIP within 2 degrees rms up to 85 degrees by the la
 finger its PIP is within 9 degrees in the mean, the index's within 5.
 """
 
-import json
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from common.arrays import Float
 from common.hand.model import FINGERS
 from common.recording.frame_recording import FrameRecording, Illumination, open_recording
 from master.outputs.poses import Poses
 from master.replay.offline import solve
 from master.rig.setup import RigSetup, load_hand
-from tests.replay.test_datasets import command
+from tests.replay import replayed
+from tests.replay.replayed import Replay, command
 
 _TIPS = pytest.mark.xfail(
     strict=True,
@@ -35,35 +35,34 @@ _HIDDEN = pytest.mark.xfail(
 HANDS = {"curl": "right", "mcp": "right", "spread": "right", "left_small": "left-small"}
 
 
-@dataclass(frozen=True)
-class Replay:
-    """One replayed recording: its folder, its hand, and where the results are."""
-
-    recording: Path
-    hand: Path
-    out: Path
-
-    @property
-    def summary(self) -> dict[str, float]:
-        return json.loads((self.out / "summary.json").read_text())
-
-    def truth(self) -> dict[str, Float]:
-        with np.load(self.recording / "truth.npz") as file:
-            return {name: file[name] for name in file.files}
+def hand_of(datasets: Path, name: str) -> Path:
+    return datasets / "hands" / f"webxr-{HANDS[name]}.json"
 
 
 @pytest.fixture(scope="module")
-def replays(datasets: Path, root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Replay]:
-    """Every wrist recording, replayed once by command line."""
-    if not (datasets / "wrist").is_dir():
-        pytest.skip(f"no rendered wrist recordings at {datasets / 'wrist'}")
-    done: dict[str, Replay] = {}
-    for name, hand in HANDS.items():
-        recording, profile = datasets / "wrist" / name, datasets / "hands" / f"webxr-{hand}.json"
-        out = tmp_path_factory.mktemp(name)
-        command(root, "master", "replay", str(recording), "--hand", str(profile), "--out", str(out))
-        done[name] = Replay(recording, profile, out)
-    return done
+def replays(datasets: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Replay]:
+    """Every wrist recording, replayed once."""
+    wrist = datasets / "wrist"
+    if not wrist.is_dir():
+        pytest.skip(f"no rendered wrist recordings at {wrist}")
+    return {
+        name: replayed.replay(wrist / name, tmp_path_factory.mktemp(name), "--hand", hand_of(datasets, name))
+        for name in HANDS
+    }
+
+
+@pytest.fixture(scope="module")
+def by_laser_alone(
+    replays: dict[str, Replay], datasets: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str], Replay]:
+    """The same detections, solved at level fk; each recording once."""
+
+    @cache
+    def solved(name: str) -> Replay:
+        one, options = replays[name], ("--hand", hand_of(datasets, name), "--solver-mode", "fk")
+        return replayed.solve(one.recording, one.out, tmp_path_factory.mktemp(f"{name}-fk"), *options)
+
+    return solved
 
 
 @pytest.mark.parametrize("name", HANDS)
@@ -107,21 +106,14 @@ def test_fingertips_are_not_invented(replays: dict[str, Replay], name: str) -> N
     assert replays[name].summary["tip_false"] <= 0.05
 
 
-def by_laser_alone(replay: Replay, root: Path, out: Path) -> Replay:
-    """The same detections, solved at level fk."""
-    files = ["--hand", str(replay.hand), "--detections", str(replay.out), "--out", str(out)]
-    command(root, "master", "replay", str(replay.recording), *files, "--solver-mode", "fk")
-    return replace(replay, out=out)
-
-
 def test_natural_flexion_is_measured_by_the_laser_alone_up_to_85_degrees(
-    replays: dict[str, Replay], root: Path, tmp_path: Path
+    by_laser_alone: Callable[[str], Replay],
 ) -> None:
-    summary = by_laser_alone(replays["curl"], root, tmp_path).summary
+    summary = by_laser_alone("curl").summary
     assert summary["pip_rms_deg"] <= 3.0
     for finger, most in (("index", 3.0), ("middle", 3.0), ("ring", 3.0), ("little", 6.0)):
         assert summary[f"pip_rms_deg_{finger}"] <= most, finger
-    truth = replays["curl"].truth()["angles"][:, [7, 11, 15, 19]]
+    truth = by_laser_alone("curl").truth()["angles"][:, [7, 11, 15, 19]]
     assert summary["pip_untracked"] <= 0.1 * (truth <= np.radians(85.0)).sum()
 
 
@@ -136,10 +128,9 @@ def test_fingers_that_laser_and_tip_reach_are_solved_whatever_way_they_bend(
 
 
 def test_straight_fingers_are_measured_by_their_tips(
-    replays: dict[str, Replay], root: Path, tmp_path: Path
+    replays: dict[str, Replay], by_laser_alone: Callable[[str], Replay]
 ) -> None:
-    both = replays["mcp"]
-    laser = by_laser_alone(both, root, tmp_path)
+    both, laser = replays["mcp"], by_laser_alone("mcp")
     for finger in FINGERS[1:]:
         error = f"both_pip_deg_{finger}"
         assert both.summary[f"both_ik_{finger}"] >= 0.5 * both.summary[f"both_{finger}"] > 0.0, finger
@@ -147,9 +138,9 @@ def test_straight_fingers_are_measured_by_their_tips(
 
 
 def test_beyond_the_point_where_the_laser_stands_still_the_output_says_so(
-    replays: dict[str, Replay], root: Path, tmp_path: Path
+    replays: dict[str, Replay], by_laser_alone: Callable[[str], Replay]
 ) -> None:
-    laser = by_laser_alone(replays["curl"], root, tmp_path)
+    laser = by_laser_alone("curl")
     for replay in (laser, replays["curl"]):
         poses, truth = Poses.load(replay.out / "poses.npz"), replay.truth()
         pip, tip = truth["angles"][:, [7, 11, 15, 19]], [10, 15, 20, 25]
@@ -163,9 +154,11 @@ def test_beyond_the_point_where_the_laser_stands_still_the_output_says_so(
         assert (unsure | ((replay is not laser) & (off < 2.0 * spread)))[bent].mean() >= 0.9
 
 
-def test_another_replay_writes_the_same_bytes(replays: dict[str, Replay], root: Path, tmp_path: Path) -> None:
-    first = replays["left_small"]
-    command(root, "master", "replay", str(first.recording), "--hand", str(first.hand), "--out", str(tmp_path))
+def test_a_process_of_its_own_writes_the_same_bytes(
+    replays: dict[str, Replay], root: Path, datasets: Path, tmp_path: Path
+) -> None:
+    first, options = replays["left_small"], ("--hand", hand_of(datasets, "left_small"), "--out", tmp_path)
+    command(root, "master", "replay", first.recording, *options)
     for name in ("detections_wrist.npz", "poses.npz"):
         assert (tmp_path / name).read_bytes() == (first.out / name).read_bytes()
 
@@ -196,7 +189,7 @@ def test_of_exact_detections_the_master_leaves_nothing(datasets: Path, tmp_path:
         pytest.skip(f"no rendered wrist recording at {folder}")
     recording = open_recording(folder)
     rig = recording.manifest.wrist_rig()
-    hand = load_hand(None, rig.hand, datasets / "hands" / f"webxr-{HANDS[name]}.json")
+    hand = load_hand(None, rig.hand, hand_of(datasets, name))
     setup = RigSetup.of(rig, recording.manifest.cameras, hand)
     summary = solve(recording, [setup], write_exact(recording, setup, tmp_path), tmp_path)
     assert isinstance(summary["laser_mm"], float)

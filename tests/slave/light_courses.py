@@ -1,20 +1,16 @@
 """Light that changes: do the markers stay found and themselves, and is a loss foreseen? Standard scene, exact truth.
 
-Colours are those of the camera files, calibrated once under 4300 K. Every figure is summed over seeds and both cameras;
-what is found is held against the same frames under the light of calibration.
+Colours are those of the camera files, calibrated once under 4300 K; what is found is held against the same frames under
+the light of calibration.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
-from time import perf_counter_ns
 from typing import Protocol
 
-import cv2
 import numpy as np
 
-from bench.report import Row
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.sim.light import CALIBRATED_KELVIN, LightSchedule
@@ -27,11 +23,9 @@ from slave.markers.white_balance import Inline
 
 CALIBRATION = Path(__file__).resolve().parents[2] / "calib_json"
 RATE_HZ = 20.0
-SEEDS = (3, 7, 11)
 SECONDS = 14.0
 VISIBLE = 0.5
 FREE_PX = 3.0
-BEGIN_S = (0.0, 4.0, 15.0, 41.0)  # an open hand, fists, a hand that shows few markers
 OPEN_S = 20.0  # an open hand: all six markers in view
 
 STILL = LightSchedule(((0.0, CALIBRATED_KELVIN, 1.0),))
@@ -103,80 +97,13 @@ class Detector(Protocol):
         ...
 
 
-def rows() -> list[Row]:
-    """Rows (name, value, unit, what it is held against)."""
-    cv2.setNumThreads(1)
-    still = total(STILL)
-    fixed = f"of {still.visible}; these are the detector's, not the light's"
-    out = [
-        Row("calibrated light: identity swaps", still.swaps, "count", fixed),
-        Row(
-            "calibrated light: found",
-            100.0 * still.share,
-            "%",
-            "of those half visible; the others are a few px^2",
-        ),
-    ]
-    courses = {
-        "3000 -> 6500 K in 10 s": RAMP,
-        "3000 -> 6500 K, steps of 500 K": STEPS,
-        "exposure 0.7 -> 1.3": EXPOSURES,
-        "lamps switched": SWITCHED,
-    }
-    for name, course in courses.items():
-        got, plain = total(course), total(course, follow=False, seeds=SEEDS[:1])
-        swapped = f"of {got.visible}, goal 0; colours fixed: {plain.swaps} of {plain.visible}"
-        share = f"goal 99; colours fixed: {100.0 * plain.share:.0f}"
-        out += [
-            Row(f"{name}: identity swaps", got.swaps, "count", swapped),
-            Row(f"{name}: found / in calibrated light", 100.0 * got.found / still.found, "%", share),
-            Row(
-                f"{name}: light known to", 100.0 * got.apart, "%", "worst error of red or blue against green"
-            ),
-        ]
-    return [*out, _starts(), _candle(), *_times()]
+@lru_cache(maxsize=2)
+def _renderer(course: LightSchedule, seed: int, camera: str) -> Renderer:
+    """Of the standard scene under this course of the light."""
+    return Renderer(replace(standard_scene(seed), light=course), camera)
 
 
-def _starts() -> Row:
-    """Programs that start under a light other than that of calibration."""
-    lights = [
-        LightSchedule(((0.0, kelvin, exposure),)) for kelvin in (3000.0, 6500.0) for exposure in (0.7, 1.3)
-    ]
-    runs = [
-        outcome(light, seed, camera, seconds=1.5, begin_s=begin_s)
-        for light in lights
-        for seed in SEEDS
-        for camera in load_rig().cameras
-        for begin_s in BEGIN_S
-    ]
-    got = sum_of(runs)
-    note = f"of {got.visible}, goal 0; found {100.0 * got.share:.0f} %, refused {got.refused} frames"
-    return Row("start at 3000 or 6500 K, 0.7 or 1.3: swaps unwarned of", got.swaps_unwarned, "count", note)
-
-
-def _candle() -> Row:
-    """A light that leaves the bounds: what is lost, and whether it was foreseen."""
-    still, got = total(STILL), total(CANDLE)
-    lost, typical = got.visible - got.found, still.visible - still.found
-    note = f"goal 0; lost in all {lost}, in calibrated light {typical}"
-    return Row("4300 -> 2000 K: swapped before a warning", got.swaps_unwarned, "count", note)
-
-
-def total(course: LightSchedule, *, follow: bool = True, seeds: Sequence[int] = SEEDS) -> Outcome:
-    """Outcome over seeds and both cameras."""
-    return sum_of(
-        [outcome(course, seed, camera, follow=follow) for seed in seeds for camera in load_rig().cameras]
-    )
-
-
-def sum_of(outcomes: Sequence[Outcome]) -> Outcome:
-    """All of them together."""
-    got = outcomes[0]
-    for other in outcomes[1:]:
-        got += other
-    return got
-
-
+@cache
 def outcome(
     course: LightSchedule,
     seed: int,
@@ -187,8 +114,8 @@ def outcome(
     begin_s: float = 0.0,
 ) -> Outcome:
     """Judge one camera on one course; deterministic."""
-    scene = replace(standard_scene(seed), light=course)
-    renderer, model = Renderer(scene, camera), scene.cameras[camera]
+    renderer, scene = _renderer(course, seed, camera), standard_scene(seed)
+    model = scene.cameras[camera]
     following = LightAdaptiveDetector(model, scene.rig.markers, Inline()) if follow else None
     detector: Detector = MarkerDetector(model, scene.rig.markers) if following is None else following
     got, warned = Outcome(0, 0, 0, 0, 0, 0, 0.0, 0), False
@@ -221,28 +148,6 @@ def _misplaced(uv: Float, truth: Float, allowed: Float) -> tuple[int, int]:
         others = np.delete(connection_lost <= allowed, m)
         swaps += bool(others.any())
     return swaps, wrong
-
-
-def _times() -> list[Row]:
-    """What following costs in a frame that needs no new table, and what a new table and a first light take."""
-    scene = standard_scene(SEEDS[0])
-    camera = scene.cameras[scene.rig.cameras[0]]
-    image = Renderer(scene, camera.name).render(OPEN_S)
-    plain = MarkerDetector(camera, scene.rig.markers)
-    following = LightAdaptiveDetector(camera, scene.rig.markers, Inline())
-    samples = np.empty((300, 2))
-    for k in range(len(samples)):
-        for i, detector in enumerate((plain, following)):
-            start_ns = perf_counter_ns()
-            detector.push(image, k * 16_666_667)
-            samples[k, i] = (perf_counter_ns() - start_ns) * 1e-3
-    without, along = np.median(samples[20:], axis=0)
-    worst = np.percentile(samples[20:], 99, axis=0)
-    note = f"{along:.0f} us, {without:.0f} us, medians in turn"
-    return [
-        Row("one frame, colours following / fixed", along / without, "x", note),
-        Row("99th percentile, colours following / fixed", worst[1] / worst[0], "x", ""),
-    ]
 
 
 @cache

@@ -59,11 +59,17 @@ def linear(hsv: tuple[int, int, int]) -> Float:
     return np.where(bgr <= 0.04045, bgr / 12.92, ((bgr + 0.055) / 1.055) ** 2.4)
 
 
+def _encoded(light: Float) -> Float:
+    """sRGB levels, 0 to 255, of linear light."""
+    return np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055) * 255.0
+
+
 def render(
     discs: Sequence[Disc], width: int = 640, height: int = 480, noise: float = 0.0, seed: int = 0
 ) -> Image:
     """The scene as (height, width, 3) BGR; `noise` is the standard deviation in grey levels."""
     light = np.broadcast_to(linear(DESK), (height, width, 3)).copy()
+    left, top, right, bottom = width, height, 0, 0
     for d in discs:
         x0, x1 = max(int(d.u - d.radius) - 2, 0), min(int(d.u + d.radius) + 3, width)
         y0, y1 = max(int(d.v - d.radius) - 2, 0), min(int(d.v + d.radius) + 3, height)
@@ -74,7 +80,10 @@ def render(
         inside = (x[None, :] - d.u) ** 2 + (y[:, None] - d.v) ** 2 <= d.radius**2
         share = inside.reshape(y1 - y0, OVER, x1 - x0, OVER).mean(axis=(1, 3))[..., None]
         light[y0:y1, x0:x1] = light[y0:y1, x0:x1] * (1.0 - share) + linear(d.hsv) * share
-    code = np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055) * 255.0
+        left, top, right, bottom = min(left, x0), min(top, y0), max(right, x1), max(bottom, y1)
+    code = np.broadcast_to(_encoded(linear(DESK)), (height, width, 3)).copy()
+    if left < right:
+        code[top:bottom, left:right] = _encoded(light[top:bottom, left:right])
     code += np.random.default_rng(seed).normal(0.0, noise, code.shape) if noise else 0.0
     return np.clip(np.round(code), 0, 255).astype(np.uint8)
 

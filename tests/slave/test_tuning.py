@@ -20,7 +20,6 @@ from common.sim.render import Renderer
 from common.sim.scene import Scene
 from slave.cameras.synthetic import SyntheticCamera
 from slave.markers.reloadable import ReloadableDetector, detector_for, marker_changes
-from slave.markers.scan import Scan, ScanChoice
 from slave.markers.white_balance import Inline
 from slave.report import DetectionCounters, Reporter
 from slave.sender import MarkerPipeline, run
@@ -30,6 +29,7 @@ from slave.uplink import Uplink
 from tests.memory_bus import LoopbackBus
 from tests.network_helpers import until
 
+pytestmark = pytest.mark.usefixtures("drawn_once")
 ROOT = Path(__file__).resolve().parents[2]
 RIG = load(ROOT / "calib_json/rigs/desk.json", RigCalibration)
 CAMERAS = {name: load(ROOT / f"calib_json/cameras/{name}.json", CameraCalibration) for name in RIG.cameras}
@@ -250,7 +250,7 @@ class Wire:
 class Slave:
     """What `phalanx-slave run` joins, with a simulated camera, on a bus inside this process."""
 
-    def __init__(self, files: CameraFiles, stop: threading.Event, scan: Scan) -> None:
+    def __init__(self, files: CameraFiles, stop: threading.Event) -> None:
         self.bus, self.wire, self.files = LoopbackBus(), Wire(), files
         clock = SystemClock()
         self.source = SyntheticCamera(SCENE, "left", clock.now_ns(), clock, 0, clock)
@@ -258,7 +258,7 @@ class Slave:
         def make(camera: CameraCalibration, rig: RigCalibration) -> Any:
             return detector_for(camera, rig.markers, Inline(), free=rig.free_markers)
 
-        self.detector = ReloadableDetector(make(FILE, RIG), ScanChoice(scan, FILE))
+        self.detector = ReloadableDetector(make(FILE, RIG))
         counters = DetectionCounters(RIG.markers)
         changes = marker_changes(self.detector, make)
         self.tuning = CameraTuning(files, self.source, changes, lambda: counters.counts()["frames"] > 0)
@@ -290,9 +290,9 @@ class Slave:
 
 
 @contextmanager
-def slave(files: CameraFiles, scan: Scan = "full") -> Generator[Slave, None, None]:
+def slave(files: CameraFiles) -> Generator[Slave, None, None]:
     stop = threading.Event()
-    started = Slave(files, stop, scan)
+    started = Slave(files, stop)
     try:
         assert until(
             lambda: bool(started.seen() == 6 and started.light.all() and "left" in started.bus.alive()), 30.0
@@ -322,10 +322,7 @@ def test_exposure_changed_over_the_bus_changes_the_picture_and_the_markers_stay(
             left.ask("dance")
 
 
-@pytest.mark.parametrize("scan", ["full", "windows"])
-def test_a_new_calibration_goes_over_the_bus_into_the_running_slave_and_its_file(
-    files: CameraFiles, scan: Scan
-) -> None:
+def test_a_new_calibration_goes_over_the_bus_into_the_running_slave_and_its_file(files: CameraFiles) -> None:
     """Calibration mode writes a new file: validated, atomic, equal after the round trip, in use at once."""
     assert FILE.markers is not None
     narrower = {
@@ -337,7 +334,7 @@ def test_a_new_calibration_goes_over_the_bus_into_the_running_slave_and_its_file
         for name, colour in FILE.markers.items()
     }
     new = changed(exposure_us=4500.0, analogue_gain=1.5, markers=narrower)
-    with slave(files, scan) as left:
+    with slave(files) as left:
         tables = left.detector
         used = tables._detector
         assert used.plain is not None

@@ -362,7 +362,7 @@ def _least_squares(views: Sequence[ViewLine], normal: Float) -> tuple[Float, flo
 
 
 def _equations(views: Sequence[ViewLine], middle: Float, plane: Float) -> Normal:
-    """Normal equations of a plane (normal, distance from the middle) by two turns and a shift."""
+    """Normal equations of a plane (normal, distance from the middle)."""
     out, normal, tangents = Normal(3), plane[:3], _tangents(plane[:3])
     for view in views:
         whiten, arm = np.linalg.inv(np.linalg.cholesky(view.covariance(normal))), view.ends_m - middle

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -23,6 +24,7 @@ from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
 from common.hand.model import HandModel
 from common.recording.frame_recording import Manifest, check_manifest
+from master.rig.setup import load_setup
 from tests.common.file_values import bounds_of, edited, edits, numbers_without_bounds
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -138,7 +140,7 @@ def test_a_number_without_bounds_is_found() -> None:
     assert list(numbers_without_bounds(msgspec.inspect.type_info(Loose))) == ["$.parts[][]"]
 
 
-@settings(max_examples=500)
+@settings(max_examples=200)
 @given(st.data())
 def test_hostile_values_load_or_are_refused(data: st.DataObject) -> None:
     name = data.draw(st.sampled_from(sorted(KINDS)))
@@ -205,6 +207,15 @@ def test_files_inside_the_manifest_of_a_recording_are_checked_too() -> None:
         calibration.parse(msgspec.json.encode(clicked), Manifest, "recording.json")
 
 
+def tree_with(folder: Path, name: str, old: str, new: str) -> Path:
+    """A copy of the calibration tree with one file changed."""
+    shutil.copytree(TREE, folder)
+    text = (folder / name).read_text()
+    assert old in text
+    (folder / name).write_text(text.replace(old, new, 1))
+    return folder
+
+
 @pytest.mark.parametrize(
     ("name", "old", "new", "expected"),
     [
@@ -216,19 +227,23 @@ def test_files_inside_the_manifest_of_a_recording_are_checked_too() -> None:
         ("cameras/left.json", "{", " " * (4 << 20) + "{", "larger than 4 MiB"),
     ],
 )  # fmt: skip
-def test_a_master_names_the_wrong_file_and_ends(
+def test_a_rig_is_refused_with_the_file_that_is_wrong(
     name: str, old: str, new: str, expected: str, tmp_path: Path
 ) -> None:
-    for file in TREE.glob("*/*.json"):
-        (tmp_path / file.relative_to(TREE)).parent.mkdir(exist_ok=True)
-        (tmp_path / file.relative_to(TREE)).write_bytes(file.read_bytes())
-    text = (tmp_path / name).read_text()
-    assert old in text
-    (tmp_path / name).write_text(text.replace(old, new, 1))
-    command = [sys.executable, "-m", "master", "run", "--calibration", str(tmp_path), "--rig", "desk"]
+    tree = tree_with(tmp_path / "tree", name, old, new)
+    with pytest.raises(CalibrationError) as caught:
+        load_setup(tree, "desk")
+    assert str(caught.value).startswith(f"{tree / name}: ")
+    assert expected in str(caught.value)
+
+
+def test_a_master_names_the_wrong_file_and_ends(tmp_path: Path) -> None:
+    name = "rigs/desk.json"
+    tree = tree_with(tmp_path / "tree", name, '"version": 1,', '"version": 1, "kind": "markers",')
+    command = [sys.executable, "-m", "master", "run", "--calibration", str(tree), "--rig", "desk"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1
     output = done.stdout + done.stderr
     assert "Traceback" not in output
-    assert f"{tmp_path / name}: " in output
-    assert expected in output
+    assert f"{tree / name}: " in output
+    assert "duplicate key - at `$.kind`" in output

@@ -62,8 +62,7 @@ def test_a_detector_distinguishes_all_eight_colours(camera: str, root: Path) -> 
     renderer, detector = Renderer(scene, camera), MarkerDetector(cameras[camera], rig.markers)
     rows = [rig.markers.index(name) for name in BACK]
     missed = worst = whole = 0.0
-    for k in range(60):
-        t_s = 18.0 + k / 30.0
+    for t_s in np.arange(18.0, 20.0, 0.1).tolist():
         image, truth = renderer.observe(t_s)
         found = detector.push(image, round(t_s * 1e9))
         clear = (truth.visible > 0.95) & (truth.area > 40.0)  # a curled finger shows a few pixels only
@@ -71,7 +70,7 @@ def test_a_detector_distinguishes_all_eight_colours(camera: str, root: Path) -> 
         whole += clear[rows].sum()
         missed += np.isnan(off[clear]).sum()
         worst = max(worst, float(np.nanmax(off[clear], initial=0.0)))
-    assert whole > 150  # the back is to the cameras
+    assert whole > 50  # of 60: the back is to the cameras
     assert missed == 0
     assert worst < 5.0  # px: of the right paint, or it would be tens
 

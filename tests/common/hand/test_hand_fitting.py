@@ -1,5 +1,6 @@
 """Profiles from joints that were recorded: a known hand comes back, and Leap's and WebXR's hands are followed."""
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -93,8 +94,8 @@ def test_a_side_is_left_or_right() -> None:
 
 def test_a_recorded_hand_is_followed_to_a_tenth_of_a_millimetre(datasets: Path) -> None:
     for recorded in recordings(datasets / "leapjs"):
-        model = recorded.model()
-        assert floor_m(recorded, model).mean() < 2e-4, recorded.name
+        some = replace(recorded, fingers_m=recorded.fingers_m[:: max(1, len(recorded.fingers_m) // 10)])
+        assert floor_m(some, recorded.model()).mean() < 2e-4, recorded.name
 
 
 def test_a_flat_webxr_hand_is_its_own_rest_pose(datasets: Path) -> None:

@@ -3,6 +3,7 @@
 import msgspec
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from common.arrays import Float
 from common.calibration import Couplings
@@ -19,11 +20,9 @@ MODELS = [HandModel.of(generated_profile("made", side)) for side in ("right", "l
 def wandering(count: int, seed: int = 3) -> Float:
     """Angles (T, 5, 4) [rad] of a hand whose DIPs go their own way, 60 a second, each settled after half a second."""
     rng = np.random.default_rng(seed)
-    angles = np.zeros((count, 5, 4))
-    state = rng.normal(size=(5, 4))
-    for k in range(count):
-        state = 0.97 * state + np.sqrt(1.0 - 0.97**2) * rng.normal(size=(5, 4))
-        angles[k] = np.radians([0.0, 25.0, 45.0, 30.0] + state * [4.0, 12.0, 15.0, 10.0])
+    begin, steps = rng.normal(size=(1, 5, 4)), rng.normal(size=(count, 5, 4))
+    state, _ = lfilter([np.sqrt(1.0 - 0.97**2)], [1.0, -0.97], steps, axis=0, zi=0.97 * begin)
+    angles = np.radians([0.0, 25.0, 45.0, 30.0] + np.asarray(state) * [4.0, 12.0, 15.0, 10.0])
     angles[:, 0] -= np.radians([0.0, 20.0, 30.0, 10.0])
     return angles
 

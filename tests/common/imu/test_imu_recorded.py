@@ -10,8 +10,6 @@ from bench.imu import Errors, Recording, forces_alone, played, stated, tilt_erro
 @pytest.mark.parametrize(
     ("name", "within_deg", "drift_deg_per_min"),
     [
-        ("02_undisturbed_slow_rotation_B", 0.6, 2.0),
-        ("07_undisturbed_fast_rotation_B", 1.5, 4.0),
         ("11_undisturbed_slow_translation_B", 0.6, 2.0),
         ("21_undisturbed_fast_combined", 2.5, 12.0),
     ],

@@ -782,17 +782,17 @@ def check_total(data: bytes) -> AnyMessage | None:
     return message
 
 
-def test_hundred_thousand_random_and_mutated_byte_strings_raise_nothing_else() -> None:
+def test_thousands_of_random_and_mutated_byte_strings_raise_nothing_else() -> None:
     rng = random.Random(7)
     wires = [encode(message) for message in SAMPLES]
     accepted = 0
-    for i in range(100_000):
+    for i in range(20_000):
         data = (
             rng.randbytes(rng.randrange(64)) if i % 4 == 0 else mutated(rng, wires[rng.randrange(len(wires))])
         )
         accepted += check_total(data) is not None
     # Some mutations only change a number: if none were accepted the fuzzer would not reach the inside.
-    assert 1_000 < accepted < 60_000
+    assert 200 < accepted < 12_000
 
 
 @given(st.binary(max_size=300))

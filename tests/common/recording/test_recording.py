@@ -9,6 +9,7 @@ import sys
 import zlib
 from collections import Counter
 from io import FileIO
+from itertools import product
 from pathlib import Path
 from typing import cast
 
@@ -52,7 +53,7 @@ def recorded(count: int = 60, step_ns: int = STEP_NS) -> list[tuple[str, Message
 
 
 def few() -> list[tuple[str, Message, int]]:
-    """In as many chunks as all, but quicker to read a thousand times."""
+    """In as many chunks as all, but quicker to read hundreds of times."""
     return recorded(18, 180_000_000)
 
 
@@ -137,8 +138,7 @@ def read_what_is_there(path: Path) -> tuple[MessageRecording, list[Recorded]] | 
 def test_a_file_cut_anywhere_reads_up_to_the_cut(tmp_path: Path) -> None:
     messages, path = few(), tmp_path / "cut.mcap"
     data, expected = written(path, messages), plain(messages)
-    cuts = sorted(random.Random(10).sample(range(len(data)), min(1000, len(data))), reverse=True)
-    assert len(cuts) == 1000
+    cuts = sorted(random.Random(10).sample(range(len(data)), 250), reverse=True)
     header = 17 + int.from_bytes(data[9:17], "little")  # magic, opcode and length; what it says
     had = len(messages)
     for cut in cuts:
@@ -191,41 +191,37 @@ def test_flipped_bytes_cost_what_they_hit_and_no_more(tmp_path: Path) -> None:
     assert most > 0, "no flip has hit anything: the check would pass on nothing"
 
 
-@pytest.mark.parametrize("bit", range(64))
-def test_a_footer_that_points_nowhere_is_none(bit: int, tmp_path: Path) -> None:
-    data = bytearray(written(tmp_path / "a.mcap", few()))
+def test_a_footer_that_points_nowhere_is_none(tmp_path: Path) -> None:
+    data, expected = bytearray(written(tmp_path / "a.mcap", few())), plain(few())
     begin = len(data) - SUMMARY_START
     (start,) = struct.unpack_from("<Q", data, begin)
-    struct.pack_into("<Q", data, begin, start ^ 1 << bit)
-    (tmp_path / "b.mcap").write_bytes(data)
-    recording = open_messages(tmp_path / "b.mcap")
-    assert recording.cut
-    assert same(list(recording.read()), plain(few()))
+    for bit in range(64):
+        struct.pack_into("<Q", data, begin, start ^ 1 << bit)
+        (tmp_path / "b.mcap").write_bytes(data)
+        recording = open_messages(tmp_path / "b.mcap")
+        assert recording.cut, bit
+        assert same(list(recording.read()), expected), bit
 
 
-@pytest.mark.parametrize("offset", [0, 2**31, 2**63 - 1, 2**63, 2**64 - 1])
-@pytest.mark.parametrize("length", [0, 8, 9, 2**40, 2**63, 2**64 - 1])
-def test_an_index_that_points_nowhere_costs_its_chunk_though_its_sum_is_right(
-    offset: int, length: int, tmp_path: Path
-) -> None:
+def test_an_index_that_points_nowhere_costs_its_chunk_though_its_sum_is_right(tmp_path: Path) -> None:
     data = bytearray(written(tmp_path / "a.mcap", few()))
     footer = len(data) - SUMMARY_START
-    (at,) = struct.unpack_from("<Q", data, footer)
-    begin, forged = at, 0
-    while at < footer - RECORD.size:
-        opcode, size = RECORD.unpack_from(data, at)
-        if opcode == Opcode.CHUNK_INDEX and not forged:
-            struct.pack_into("<QQ", data, at + RECORD.size + 16, offset, length)  # behind its two times
-            forged += 1
-        at += RECORD.size + size
-    assert forged
-    struct.pack_into("<I", data, footer + 16, zlib.crc32(data[begin : footer + 16]))
-    (tmp_path / "b.mcap").write_bytes(data)
-    recording = open_messages(tmp_path / "b.mcap")
-    assert not recording.cut
-    read = list(recording.read())
-    assert recording.broken == 1
-    assert 0 < len(read) < len(few())
+    (begin,) = struct.unpack_from("<Q", data, footer)
+    at = begin
+    while (row := RECORD.unpack_from(data, at))[0] != Opcode.CHUNK_INDEX:
+        at += RECORD.size + row[1]
+        assert at < footer - RECORD.size, "no chunk stands in the index"
+    for offset, length in product(
+        (0, 2**31, 2**63 - 1, 2**63, 2**64 - 1), (0, 8, 9, 2**40, 2**63, 2**64 - 1)
+    ):
+        struct.pack_into("<QQ", data, at + RECORD.size + 16, offset, length)  # behind its two times
+        struct.pack_into("<I", data, footer + 16, zlib.crc32(data[begin : footer + 16]))
+        (tmp_path / "b.mcap").write_bytes(data)
+        recording = open_messages(tmp_path / "b.mcap")
+        assert not recording.cut
+        read = list(recording.read())
+        assert recording.broken == 1, (offset, length)
+        assert 0 < len(read) < len(few())
 
 
 @pytest.mark.parametrize(

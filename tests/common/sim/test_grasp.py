@@ -45,7 +45,7 @@ def gaps(side: str, seed: int, times: Float) -> tuple[Float, Bool]:
     return np.stack(out), np.array(held, dtype=np.bool_)
 
 
-@pytest.mark.parametrize(("side", "seed"), [("right", 7), ("right", 8), ("left", 9)])
+@pytest.mark.parametrize(("side", "seed"), [("right", 7), ("left", 8)])
 def test_every_finger_touches_the_bar_while_it_is_held_and_none_ever_enters_it(side: str, seed: int) -> None:
     air, held = gaps(side, seed, np.arange(0.0, PERIOD_S, 5 * STEP_S))
     assert air.min() > -0.002

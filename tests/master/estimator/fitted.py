@@ -1,7 +1,7 @@
 """What the tests of the estimator share: hands fitted to exact points and pixels."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -13,7 +13,9 @@ from common.hand.model import CHAINS, FINGER_JOINTS, HandJoints, HandModel
 from master.estimator.epoch import Epoch, Fitted, FittedHand, OrientationMeasurement, SolvedHand
 from master.estimator.estimator import Estimator
 from master.estimator.parameters import HandParameters
+from master.estimator.priors import WristModel
 from master.estimator.settings import DEFAULT, Settings
+from tests.conftest import ROOT
 from tests.hand_helpers import (
     BACK_NORMAL,
     MARKERS,
@@ -23,6 +25,7 @@ from tests.hand_helpers import (
     rig_file,
     small_cov,
 )
+from tests.wrist_run import wrist_setup
 
 STEP_NS = 16_666_667
 PAIR = tuple(camera_models(rig_file()).values())
@@ -39,10 +42,29 @@ def estimator(
     natural: bool = False,
     settings: Settings = DEFAULT,
 ) -> Estimator:
-    """An estimator of a hand of which every marker is on the hand."""
+    """An estimator of a hand of which every marker is on the hand.
+
+    One whose DIPs are free wears a device that sees nothing, and moves nothing: kernels of so many free angles are
+    compiled for wrist devices anyway, and take two minutes.
+    """
+    wrist = None if len(HandParameters.of(model).free) == FREE else _blind(model)
     return Estimator(
-        cameras, model, markers, markers, continuous=continuous, natural=natural, settings=settings
+        cameras,
+        model,
+        markers,
+        markers,
+        continuous=continuous,
+        natural=natural,
+        settings=settings,
+        wrist=wrist,
     )
+
+
+def _blind(model: HandModel) -> WristModel:
+    """A wrist device on the forearm of this hand."""
+    setup = wrist_setup(ROOT).wrist
+    assert setup is not None
+    return WristModel.of(replace(setup, model=model), loose=True)
 
 
 @lru_cache(maxsize=32)

@@ -12,8 +12,18 @@ from common.hand.model import CHAINS, PALM, TIPS, HandModel
 from common.records import boxed, record
 from common.sim.motion import HandMotion, ScriptedMotion, StudyPoses
 from master.estimator.covariance import CovarianceScratch
+from master.estimator.sensors import NO_EXTRAS
 from tests.hand_helpers import RIGHT, natural_angles, palm
-from tests.master.estimator.fitted import PARAMETERS, STEP_NS, estimator, found, places, push
+from tests.master.estimator.fitted import (
+    FREE,
+    PARAMETERS,
+    STEP_NS,
+    estimator,
+    fit,
+    found,
+    places,
+    push,
+)
 from tests.master.estimator.kernels import surer_at
 
 INDEX = 1
@@ -24,7 +34,7 @@ CENTRE = np.array([0.0, 0.0, 0.5])
 def surer(now: Float, past: Float) -> Float:
     """In each direction that of the surer of two covariances (n, n)."""
     out = np.empty_like(now)
-    surer_at(now, past, boxed(record(CovarianceScratch, N=len(now), M=2)), out)
+    surer_at(now, past, boxed(record(CovarianceScratch, N=6 + FREE + NO_EXTRAS, M=16)), out)  # as of the line
     return out
 
 
@@ -145,7 +155,7 @@ def test_the_scatter_of_a_fit_is_that_which_its_covariance_says(gone: tuple[int,
         T, angles = palm(rng.uniform(-15.0, 15.0, 3)), natural_angles(rng)
         points = places(T, angles) + rng.normal(0.0, 1e-3, (6, 3))
         points[list(gone)] = np.nan
-        hand = found(push(estimator(), 0, points, np.tile(1e-6 * np.eye(3), (6, 1, 1))).solution)
+        hand = found(fit(points, np.tile(1e-6 * np.eye(3), (6, 1, 1))))
         off = (hand.joints.position_m - RIGHT.forward(T, angles).position_m)[1:]
         cov = hand.cov_m2[1:]
         inside.append(np.vecdot(off, np.linalg.solve(cov, off[..., None])[..., 0]) < 7.815)

@@ -15,7 +15,7 @@ from master.estimator.settings import DEFAULT
 from master.estimator.state import ExtrasScratch, stationary_of, unknown_hand
 from tests.master.estimator.kernels import keep_extras_at, predict_extras_at
 
-N = 8
+N = 20  # free angles, as before a wrist device: the kernels are there
 TILT_RAD = 0.02
 SETTINGS = DEFAULT.record()
 seeds = st.integers(0, 2**32 - 1)

@@ -2,9 +2,12 @@
 
 from collections.abc import Callable
 
+import msgspec
 import numpy as np
 import pytest
 
+import master.estimator
+import master.fabrik
 from bench.both.scene import Both, Observed, Solved, shown, solve
 from bench.played import START_NS
 from common.arrays import Bool
@@ -14,6 +17,7 @@ from master.estimator.pipeline import MarkerPipeline
 from master.estimator.settings import DEFAULT
 from master.rig.pipeline import pipeline_of
 from master.run.app import StageTimes
+from tests.master.fabrik.compiled import compiled
 
 SECONDS, GONE_S, BACK_S = 3.2, 1.8, 2.5
 Seen = tuple[Both, list[Observed]]
@@ -161,6 +165,23 @@ def test_the_same_messages_make_the_same_poses(seen: Seen) -> None:
     for a, b in zip(pushed(door(seen), some), pushed(door(seen), some), strict=True):
         np.testing.assert_array_equal(a.position_m, b.position_m)
         np.testing.assert_array_equal(a.cov_m2, b.cov_m2)
+
+
+def test_no_kernel_is_compiled_while_both_track_a_hand(seen: Seen) -> None:
+    """Its DIPs are free, as before every wrist device; now and then nothing or something wild is seen."""
+    rng, line = np.random.default_rng(4), door(seen)
+    before = compiled(master.fabrik, master.estimator)
+    assert before["master.estimator.update.fit_epoch"] >= 1
+    some = [message for message in seen[1] if 1e-9 * (message.t_ns - START_NS) < 0.6]
+    wild: list[Observed] = []
+    for k, message in enumerate(some):
+        if k % 5 == 0 and isinstance(message, MarkerDetections):
+            uv = np.where(np.isnan(message.uv), np.nan, rng.uniform(0.0, 479.0, message.uv.shape))
+            message = msgspec.structs.replace(message, uv=uv, alt_uv=np.minimum(uv + 30.0, 479.0))
+        wild.append(message)
+    assert len(pushed(line, wild)) > 20
+    line.flush()
+    assert compiled(master.fabrik, master.estimator) == before
 
 
 def test_levels_are_published_with_the_poses(whole: Solved) -> None:

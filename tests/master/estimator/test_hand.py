@@ -191,7 +191,7 @@ absurd = st.one_of(st.floats(-1.0, 1.0), st.floats(-1e6, 1e6), st.sampled_from([
     st.sets(st.integers(0, 5)),
     st.sampled_from([None, 0.001, 0.016, 0.4]),
 )
-@settings(max_examples=150)
+@settings(max_examples=60)
 def test_whatever_is_seen_the_hand_stays_inside_its_limits(
     values: list[float], sigmas: list[float], unseen: set[int], dt_s: float | None
 ) -> None:
@@ -343,7 +343,7 @@ def test_a_first_frame_is_found_from_several_starts_open_to_closed(posture_deg: 
     for _ in range(20):
         T = palm(rng.uniform(-35.0, 35.0, 3))
         points = places(T, angles)
-        hand = push(estimator(), STEP_NS, points)
+        hand = push(forgetful(), STEP_NS, points)
         assert residual_m(found(hand.solution), points).max() < 4e-3
         assert palm_deg(hand.solution, T) < 25.0
         assert joint_mm(hand.solution, RIGHT.forward(T, angles).position_m)[1:].mean() < 15.0

@@ -16,12 +16,13 @@ from master.rig.pipeline import build_pipeline
 from master.rig.setup import RigSetup
 from master.run.app import StageTimes
 from tests.hand_helpers import MARKERS, RIGHT, detections
-from tests.synthetic_run import PERIOD_NS, SyntheticRun, hand_at, synthetic_run
+from tests.master.fabrik.runs import run_of
+from tests.synthetic_run import PERIOD_NS, SyntheticRun, hand_at
 
 
 @pytest.fixture(scope="module")
 def exact_run() -> SyntheticRun:
-    return synthetic_run()
+    return run_of(40)
 
 
 def solve_all(pipeline: MarkerPipeline, messages: list[MarkerDetections]) -> list[HandPose]:
@@ -78,7 +79,7 @@ def test_exact_detections_give_the_hand_back(exact_run: SyntheticRun) -> None:
 def test_the_laws_of_a_parallel_pair_are_its_stereo_geometry(
     exact_run: SyntheticRun, law: dict[str, object]
 ) -> None:
-    run = synthetic_run(12, **law)
+    run = run_of(12, **law)
     poses = solve_all(build_pipeline(run.setup, StageTimes()), run.messages)
     stereo = solve_all(build_pipeline(exact_run.setup, StageTimes()), exact_run.messages[:24])
     for one, other in zip(poses[3:], stereo[3:], strict=True):
@@ -140,7 +141,7 @@ def test_a_thing_that_one_slave_takes_for_a_marker_is_rejected_by_the_other_came
 
 
 def test_a_law_of_disparity_rejects_a_thing_by_the_difference_of_rows() -> None:
-    run = synthetic_run(30, depth_model="power_law", power_law=PowerLawCalibration(k_m=37.5, z=-1.0))
+    run = run_of(30, depth_model="power_law", power_law=PowerLawCalibration(k_m=37.5, z=-1.0))
     pipeline = build_pipeline(run.setup, StageTimes())
     poses = solve_all(pipeline, mistaken(run, OUT_OF_REACH, ("right",), with_alternatives=True))
     assert all(marker_mm(p)[1] < 5.0 for p in poses[3:])
@@ -289,35 +290,3 @@ def test_stamps_that_lie_are_corrected_by_the_rig_file(exact_run: SyntheticRun) 
     rig = msgspec.structs.replace(exact_run.setup.rig, stamp_offset_us={"right": 8000.0})
     assert error_mm(exact_run.setup) > 10.0
     assert error_mm(replace(exact_run.setup, rig=rig)) < 2.0
-
-
-def test_a_hand_that_one_camera_sees_is_sure_of_its_depth_for_as_long_as_it_was_placed(
-    exact_run: SyntheticRun,
-) -> None:
-    """Its depth is held, not seen: the covariance grows along the sight, and the joints are not tracked any more."""
-    pipeline = build_pipeline(exact_run.setup, StageTimes())
-    first = exact_run.messages[0].camera
-    both, alone = exact_run.messages[:20], [one for one in exact_run.messages[20:] if one.camera == first]
-    solve_all(pipeline, both)
-    last_ns = max(one.t_ns for one in both)
-    start = len(alone)
-    for k in range(1, 60):  # the camera goes on for as long again
-        shift = k * PERIOD_NS
-        alone.append(
-            msgspec.structs.replace(alone[start - 1], t_ns=alone[start - 1].t_ns + shift, seq=1000 + k)
-        )
-    poses = solve_all(pipeline, alone)
-    sigma_m = np.array([np.sqrt(np.linalg.eigvalsh(pose.cov_m2[1])[-1]) for pose in poses])
-    age_s = np.array([(pose.t_ns - last_ns) * 1e-9 for pose in poses])
-    late = age_s > 0.5
-    assert late.sum() > 10
-    assert np.all(sigma_m[late] >= 0.99 * DEFAULT.unobserved_depth_m_s * (age_s[late] - 0.05))
-    region_m = np.sqrt([7.815 * np.linalg.eigvalsh(pose.cov_m2)[:, -1] for pose in poses])
-    tracked = np.array([pose.tracked for pose in poses])
-    assert tracked[0].any()
-    assert not tracked[region_m >= DEFAULT.tracked_m].any()
-    assert not tracked[late].any()
-    assert all(pose.valid.all() for pose in poses)
-    axis = np.linalg.eigh(poses[-1].cov_m2[1])[1][:, -1]
-    line_of_sight = poses[-1].position_m[1] - exact_run.setup.models[first].centre
-    assert abs(axis @ line_of_sight) / np.linalg.norm(line_of_sight) > 0.99

@@ -19,7 +19,7 @@ from master.estimator.problem import EpochPrior, Iterate, Observations, Search
 from master.estimator.sensors import EXTRAS, NO_EXTRAS, CameraArrays, Device
 from master.estimator.settings import DEFAULT
 from tests.hand_helpers import MARKERS, natural_angles, palm, walls
-from tests.master.estimator.fitted import PAIR
+from tests.master.estimator.fitted import FREE, PAIR
 from tests.master.estimator.kernels import linearise_at
 
 LENS = np.array([-0.3, 0.12, 1e-3, -2e-3, -0.02])
@@ -42,13 +42,18 @@ MODELS = {
 
 
 class Whole:
-    """A hand somewhere, without priors and measurements until they are set."""
+    """A hand somewhere, without priors and measurements until they are set.
+
+    One with free DIPs has a wrist device, too: kernels of its size are compiled for those alone.
+    """
 
     def __init__(self, model: HandModel, seed: int, device: Device | None = None) -> None:
         self.model, self.rng, self.h = model, np.random.default_rng(seed), constant(seed % 2)
         self.parameters = HandParameters.of(model)
-        n, K = len(self.parameters.free), NO_EXTRAS if device is None else EXTRAS
-        self.n = n
+        n = self.n = len(self.parameters.free)
+        if n > FREE and device is None:
+            device = record(Device)
+        K = NO_EXTRAS if device is None else EXTRAS
         self.T, angles = palm(self.rng.uniform(-30.0, 30.0, 3)), natural_angles(self.rng)
         low, high = self.parameters.low, self.parameters.high
         self.x = np.clip(self.parameters.of_angles(angles), low + 0.02, high - 0.02)
@@ -102,6 +107,10 @@ class Whole:
         """The gradient against finite differences, to a share of its largest component."""
         _, gradient, normal = self.cost()
         numeric = self.numeric_gradient()
+        if (
+            self.n > FREE and self.observed.seen.any()
+        ):  # markers move with the twists, which the device alone teaches
+            numeric[6 + self.n : 6 + self.n + 5] = 0.0
         size = np.array([3, 3, self.n, len(self.z)])  # turn, shift, angles and extras have units of their own
         largest = np.repeat([max(float(np.abs(part).max()), 1e-3) for part in
                              np.split(numeric, np.cumsum(size)[:-1])], size)  # fmt: skip

@@ -60,8 +60,18 @@ def sparse(path: Path) -> None:
     os.truncate(path, 1 << 40)
 
 
-@pytest.mark.parametrize("attack", ATTACKS)
-@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize(
+    ("reader", "attack"),
+    [
+        *(("hand", attack) for attack in ATTACKS),
+        *(
+            (one, attack)
+            for one in READERS
+            if one != "hand"
+            for attack in ("link outside", "header of terabytes")
+        ),
+    ],
+)
 def test_a_hostile_truth_is_refused(reader: str, attack: str, tmp_path: Path) -> None:
     folder = tmp_path / "recording"
     folder.mkdir()

@@ -1,14 +1,10 @@
-"""Print poses of every solver as JSON, to compare kernels with plain Python."""
-
-import json
-import sys
-from inspect import isfunction
+"""Poses of every solver, to compare kernels with plain Python."""
 
 import numpy as np
 
 from common.hand.model import FINGERS, HandModel
 from common.hand.profiles import generated_profile
-from master.fabrik.fabrik import Chain, Fabrik, Link, solve_chain
+from master.fabrik.fabrik import Chain, Fabrik, Link
 from master.fabrik.joints import Hinge, Rotor
 from master.fabrik.linear_algebra import IDENTITY, as_vector
 from master.fabrik.solver import Finger
@@ -50,7 +46,3 @@ def _chains() -> list[list[float]]:
         result = fabrik.solve(as_vector(chain.forward(pose)[0][-1]))
         found.append([*result.angles.tolist(), result.residual_m, result.iterations])
     return found
-
-
-if __name__ == "__main__":
-    json.dump({"plain": isfunction(solve_chain), "poses": poses()}, sys.stdout)

@@ -1,9 +1,6 @@
 """The line given whatever the wire lets pass: nothing raises, nothing poisons it, nothing is compiled on the way."""
 
-import importlib
-import pkgutil
 from dataclasses import replace
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -12,7 +9,6 @@ import pytest
 import master.estimator
 import master.fabrik
 from common.calibration import PowerLawCalibration
-from common.calibration.hand import Couplings
 from common.hand.model import HandModel
 from common.messages import HandPose, MarkerDetections, Source, decode, encode
 from common.messages.parts import MAX_PICTURE
@@ -22,7 +18,9 @@ from master.fabrik.triangulate import DepthTriangulator, disparity_tables
 from master.rig.pipeline import build_pipeline, line_of
 from master.run.app import StageTimes
 from tests.hand_helpers import LEFT, MARKERS, RIGHT
-from tests.synthetic_run import SyntheticRun, synthetic_run
+from tests.master.fabrik.compiled import compiled
+from tests.master.fabrik.runs import run_of
+from tests.synthetic_run import SyntheticRun
 
 LAWS: list[dict[str, object]] = [
     {"depth_model": "power_law", "power_law": PowerLawCalibration(k_m=37.5, z=-1.0)},
@@ -33,7 +31,7 @@ BEFORE, STORM = 10, 40  # frames of a hand, then frames of anything
 
 @pytest.fixture(scope="module", params=LAWS, ids=["law", "stereo"])
 def run(request: pytest.FixtureRequest) -> SyntheticRun:
-    return synthetic_run(BEFORE + STORM + 20, **request.param)
+    return run_of(BEFORE + STORM + 20, **request.param)
 
 
 def anything(message: MarkerDetections, rng: np.random.Generator) -> MarkerDetections:
@@ -97,7 +95,7 @@ def test_a_point_is_placed_with_its_covariance_or_not_at_all(law: PowerLaw, run:
     hand = hands[-1]
     assert hand is not None
     unsure = replace(hand, tilt_cov_rad2=np.full((5, 3, 3), np.nan))
-    for k in range(3000):
+    for k in range(1000):
         uv = rng.uniform(-MAX_PICTURE, 2 * MAX_PICTURE, (2, 6, 2))
         uv[1] = uv[0] - [10.0 ** rng.uniform(-13.0, 4.5), 0.0]
         found = place(uv, np.full((2, 6), 0.1), np.full((2, 6), 400.0), unsure if k % 3 == 0 else hand, 0.02)
@@ -106,7 +104,7 @@ def test_a_point_is_placed_with_its_covariance_or_not_at_all(law: PowerLaw, run:
         np.testing.assert_array_equal(whole, np.isfinite(found.noise_m2).all(axis=(1, 2)))
         triangulated += int(whole.sum())
         assert not whole[:5].any() or k % 3 > 0
-    assert triangulated > 500
+    assert triangulated > 150
 
 
 def test_caps_are_looked_at_as_of_the_hand_that_is_given_and_its_age(run: SyntheticRun) -> None:
@@ -123,39 +121,20 @@ def test_caps_are_looked_at_as_of_the_hand_that_is_given_and_its_age(run: Synthe
     assert (np.trace(old.cov_m2[:5], axis1=1, axis2=2) > np.trace(fresh.cov_m2[:5], axis1=1, axis2=2)).all()
 
 
-def compiled() -> dict[str, int]:
-    """How many types of arguments each kernel of line and estimator is compiled for."""
-    counts: dict[str, int] = {}
-    rooms = (master.fabrik.__path__, "master.fabrik."), (master.estimator.__path__, "master.estimator.")
-    for module in (module for scratch in rooms for module in pkgutil.iter_modules(*scratch)):
-        if not module.name.endswith("__main__"):
-            kernels: dict[str, Any] = vars(importlib.import_module(module.name))
-            counts |= {
-                f"{module.name}.{name}": len(kernel.signatures)
-                for name, kernel in kernels.items()
-                if hasattr(kernel, "signatures")
-            }
-    return counts
-
-
-def free_dip() -> HandModel:
-    couplings = Couplings(dip_per_pip=None)
-    return HandModel.of(msgspec.structs.replace(RIGHT.profile, couplings=couplings))
-
-
 @pytest.mark.parametrize("continuous", [True, False])
-@pytest.mark.parametrize("model", [RIGHT, LEFT, free_dip()], ids=["right", "left", "free DIP"])
+@pytest.mark.parametrize("model", [RIGHT, LEFT], ids=["right", "left"])
 def test_no_kernel_is_compiled_while_a_hand_is_tracked(
     run: SyntheticRun, model: HandModel, continuous: bool
 ) -> None:
+    """Nor of one whose DIPs are free: `tests.master.estimator.test_fused_pipeline`."""
     rng = np.random.default_rng(4)
     setup = replace(run.setup, hand=model)
     pipeline = build_pipeline(setup, StageTimes(), continuous=continuous)
-    before = compiled()
+    before = compiled(master.fabrik, master.estimator)
     assert before["master.estimator.update.fit_epoch"] >= 1
     for k, message in enumerate(run.messages):
         sent = anything(message, rng) if k % 5 == 0 else message
         alternative = np.where(rng.random((6, 1)) < 0.1, np.minimum(sent.uv + 30.0, [639.5, 479.5]), np.nan)
         pipeline.push(msgspec.structs.replace(sent, alt_uv=alternative))
     pipeline.flush()
-    assert compiled() == before
+    assert compiled(master.fabrik, master.estimator) == before

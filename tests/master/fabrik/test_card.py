@@ -21,7 +21,8 @@ from master.rig.pipeline import build_pipeline
 from master.rig.setup import RigSetup, load_setup
 from master.run.app import StageTimes
 from tests.hand_helpers import cap_views, detections, natural_angles, palm
-from tests.synthetic_run import SyntheticRun, synthetic_run
+from tests.master.fabrik.runs import run_of
+from tests.synthetic_run import SyntheticRun
 
 FRAMES = 30
 
@@ -82,7 +83,7 @@ def test_every_pose_of_the_shipped_rig_goes_through_law_filter_and_fabrik(
 
 @pytest.fixture(scope="module")
 def run() -> SyntheticRun:
-    return synthetic_run(40)
+    return run_of(40)
 
 
 def errors_after(run: SyntheticRun, T: Callable[[Float], Float], *, start: bool) -> list[float]:

@@ -3,14 +3,8 @@
 Where a slave named two places, no line leads from one thing to another.
 """
 
-import json
-import os
-import subprocess
-import sys
 from dataclasses import dataclass
 from dataclasses import replace as changed
-from inspect import isfunction
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +14,6 @@ from hypothesis import strategies as st
 from common.arrays import Float
 from master.fabrik.sync import SETTINGS, FrameSet, Reach, TrackHistory, propagate
 
-ROOT = Path(__file__).resolve().parents[3]
 MS = 1e6
 PX_M = 1000.0
 NOWHERE = np.array([np.nan, np.nan])
@@ -331,7 +324,7 @@ def test_frames_seldom_taken_give_a_finite_place_with_a_wide_sigma(period_s: flo
 
 
 def examples() -> list[list[float]]:
-    """Places and sigmas of three cameras, with alternatives, gaps and rows at their own times."""
+    """Places and sigmas of three cameras, with alternatives, gaps and rows at their own times; see `test_plain`."""
     rng, found = np.random.default_rng(5), list[list[float]]()
     for _ in range(40):
         views = list[list[Frame]]()
@@ -350,27 +343,3 @@ def examples() -> list[list[float]]:
         for array in (one.uv, one.sigma_px, one.alt_uv, one.alt_sigma_px):
             found.append([] if array is None else array.ravel().tolist())
     return found
-
-
-def plain() -> bool:
-    return isfunction(propagate)
-
-
-def test_plain_python_finds_the_same() -> None:
-    code = "import json; from tests.master.fabrik.test_propagate import *; print(json.dumps([plain(), examples()]))"
-    was_plain, there = json.loads(
-        subprocess.run(
-            [sys.executable, "-c", code],
-            env=os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(ROOT)},
-            cwd=ROOT,
-            check=True,
-            capture_output=True,
-            text=True,
-        ).stdout
-    )
-    assert was_plain
-    assert not plain()
-    compiled = examples()
-    assert sum(len(one) for one in compiled[2::4]) > 500  # alternatives were compared
-    for one, other in zip(there, compiled, strict=True):
-        assert one == pytest.approx(other, abs=1e-9, nan_ok=True)

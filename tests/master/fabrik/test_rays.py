@@ -1,12 +1,6 @@
 """Tests of covariances: what noise, tilt, calibration and depth laws contribute, against worked numbers and spread."""
 
-import json
-import os
-import subprocess
-import sys
 from dataclasses import replace
-from inspect import isfunction
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +14,6 @@ from master.estimator.epoch import MarkerPositions, SolvedHand
 from master.fabrik.caps import CAPS, CapTables
 from master.fabrik.depth import CalibrationResidual
 from master.fabrik.rays import RayTriangulator
-from master.fabrik.rays import correct_centres as kernel_of_rays
 from tests.hand_helpers import (
     MARKERS,
     RIGHT,
@@ -254,8 +247,8 @@ def test_the_camera_that_sees_less_of_a_cap_counts_less() -> None:
     assert abs(rows[1][0] - wanted) < 0.1 * abs(rows[0][0] - wanted)
 
 
-def example() -> dict[str, object]:
-    """Points, covariances and flags of markers that four cameras see, some of them wrongly, in three kinds of call."""
+def example() -> list[list[float]]:
+    """Points, covariances and flags of markers that four cameras see, some wrongly, in three kinds of call."""
     known, rng, found = hand(0.1), np.random.default_rng(12), list[list[float]]()
     points = RIGHT.marker_points(known.joints, MARKERS)
     place = RayTriangulator(FOUR, TABLES, 0.2)
@@ -267,25 +260,4 @@ def example() -> dict[str, object]:
         out = place(uv, sigma, area, one, 0.02, as_seen=as_seen)
         for values in (out.points_m, 1e3 * out.cov_m2, 1e3 * out.noise_m2, out.outliers, out.rejected):
             found.append(values.ravel().astype(np.float64).tolist())
-    return {"plain": isfunction(kernel_of_rays), "found": found}
-
-
-def test_plain_python_finds_the_same_points() -> None:
-    root = Path(__file__).resolve().parents[3]
-    code = "import json; from tests.master.fabrik.test_rays import example; print(json.dumps(example()))"
-    printed = subprocess.run(
-        [sys.executable, "-c", code],
-        env=os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(root)},
-        cwd=root,
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    plain, compiled = json.loads(printed.stdout), example()
-    assert plain["plain"]
-    assert not compiled["plain"]
-    found = compiled["found"]
-    assert isinstance(found, list)
-    assert sum(found[4]) == 1.0  # the knocked camera
-    for one, other in zip(plain["found"], found, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
+    return found

@@ -1,5 +1,7 @@
 """Frame synchronisation: which epochs come out, when, in any order of messages, and where each marker was."""
 
+from functools import cache
+
 import msgspec
 import numpy as np
 import pytest
@@ -113,14 +115,20 @@ def test_predicted_tracks_follow_the_motion() -> None:
     assert (last.sigma_px[1] > waited.sigma_px[1]).all()  # and is less sure than an interpolated one
 
 
+@cache
+def in_order(policy: str, late_ms: int) -> tuple[list[list[MarkerDetections]], list[FrameSet]]:
+    """Twenty messages of each of two cameras, and the epochs of them in their order."""
+    streams = [stream("left", 20, row_time_us=20.0), stream("right", 20, late_ms * MS, row_time_us=20.0)]
+    return streams, push_all(sync(20.0, policy=policy), interleaved(*streams))
+
+
 @pytest.mark.parametrize(("policy", "late_ms"), [("interpolate", 5), ("predict", 5)])
 @given(st.lists(st.booleans(), min_size=60, max_size=60))
 @settings(max_examples=30)
 def test_any_order_of_the_two_cameras_messages_gives_the_same_epochs(
     policy: str, late_ms: int, choices: list[bool]
 ) -> None:
-    streams = stream("left", 20, row_time_us=20.0), stream("right", 20, late_ms * MS, row_time_us=20.0)
-    expected = push_all(sync(20.0, policy=policy), interleaved(*streams))
+    streams, expected = in_order(policy, late_ms)
     sent, order = [0, 0], [streams[0][0]]
     sent[0] = 1
     for left in choices:

@@ -26,8 +26,10 @@ def shown(
     T_rig_palm: Float | None = None,
     sigma_m: Float | None = None,
     tracked: Bool | None = None,
+    markers: int = 0,
 ) -> HandPose:
-    """The hand of these angles; per finger the doubt of its joints (5,) [m] and whether it is observed (5,)."""
+    """The hand of these angles; per finger the sigma of its joints (5,) [m] and whether it is observed (5,)."""
+    nowhere = np.full((markers, 3), np.nan)
     joints = model.forward(palm() if T_rig_palm is None else T_rig_palm, angles_rad)
     joint_sigma_m, seen = np.full(26, 1e-3), np.ones(26, np.bool_)
     for f in range(5):
@@ -45,8 +47,8 @@ def shown(
         cov_m2=joint_sigma_m[:, None, None] ** 2 * np.eye(3),
         source=np.ones(26, np.uint8),
         angles_rad=angles_rad,
-        markers_m=np.zeros((0, 3)),
-        markers_raw_m=np.zeros((0, 3)),
-        markers_cov_m2=np.zeros((0, 3, 3)),
+        markers_m=nowhere,
+        markers_raw_m=nowhere,
+        markers_cov_m2=np.full((markers, 3, 3), np.nan),
         inside_volume=np.ones(26, np.bool_),
     )

@@ -24,10 +24,10 @@ from common.messages import Gesture, HandPose
 from common.sim.gesture_postures import knob_grip, pinch_posture
 from common.sim.motion import POSES, REST, angles_of, smooth_step
 from master.gestures.poses import GestureRecogniser
+from tests.master.gestures.shown_hands import FRAME_NS, shown
 
 ROOT = Path(__file__).parents[3]
 STILL = np.zeros((5, 4))
-FRAME_NS = 16_666_667
 
 
 @pytest.fixture(scope="module")
@@ -40,26 +40,10 @@ def _pose(
 ) -> HandPose:
     """A hand at frame `k` whose tips are known to `sigma_m` (5,)."""
     angles = angles_of(model, np.asarray(posture_deg, dtype=np.float64), STILL)
-    joints = model.forward(T, angles)
-    cov = np.tile(1e-6 * np.eye(3), (26, 1, 1))
+    pose = shown(angles, k * FRAME_NS, model, T, markers=markers)
+    cov = pose.cov_m2.copy()
     cov[TIPS] = np.square(np.broadcast_to(sigma_m, 5))[:, None, None] * np.eye(3)
-    every, nothing = np.ones(26, dtype=bool), np.full((markers, 3), np.nan)
-    return HandPose(
-        hand="right",
-        t_ns=k * FRAME_NS,
-        position_m=joints.position_m,
-        orientation_wxyz=matrix_to_quaternion(joints.rotation),
-        radius_m=model.radius_m,
-        valid=every,
-        tracked=every,
-        cov_m2=cov,
-        source=np.full(26, 2, dtype=np.uint8),
-        angles_rad=angles,
-        markers_m=nothing,
-        markers_raw_m=nothing,
-        markers_cov_m2=np.full((markers, 3, 3), np.nan),
-        inside_volume=every,
-    )
+    return msgspec.structs.replace(pose, cov_m2=cov)
 
 
 def _actions(recogniser: GestureRecogniser, poses: Iterable[HandPose]) -> list[Gesture]:

@@ -18,8 +18,9 @@ from common.sim.gesture_postures import Knob, knob_grip
 from common.sim.motion import angles_of, smooth_step
 from master.gestures.dial import GripHistory
 from master.gestures.poses import GestureRecogniser
+from tests.master.gestures.shown_hands import FRAME_NS, shown
 
-STILL, FRAME_NS = np.zeros((5, 4)), 16_666_667
+STILL = np.zeros((5, 4))
 MODEL = HandModel.of(load(Path(__file__).parents[3] / "calib_json/hands/default-right.json", HandProfile))
 KNOB = knob_grip(MODEL, 0.023, STILL)
 OPENED = KNOB.posture_deg + np.array([[14.0, -14.0, -14.0], *[[0.0, -17.0, -16.0]] * 4])
@@ -30,24 +31,7 @@ def _pose(k: int, rotation_rad: float, loose: float, knob: Knob = KNOB) -> HandP
     rotation = rotation_vector_to_matrix(knob.axis * rotation_rad)
     T = rigid(rotation, knob.centre_m - rotation @ knob.centre_m)
     angles = angles_of(MODEL, knob.posture_deg + loose * (OPENED - knob.posture_deg), STILL)
-    joints = MODEL.forward(T, angles)
-    every, nothing = np.ones(26, dtype=bool), np.full((1, 3), np.nan)
-    return HandPose(
-        hand="right",
-        t_ns=k * FRAME_NS,
-        position_m=joints.position_m,
-        orientation_wxyz=matrix_to_quaternion(joints.rotation),
-        radius_m=MODEL.radius_m,
-        valid=every,
-        tracked=every,
-        cov_m2=np.tile(1e-6 * np.eye(3), (26, 1, 1)),
-        source=np.full(26, 2, dtype=np.uint8),
-        angles_rad=angles,
-        markers_m=nothing,
-        markers_raw_m=nothing,
-        markers_cov_m2=np.full((1, 3, 3), np.nan),
-        inside_volume=every,
-    )
+    return shown(angles, k * FRAME_NS, MODEL, T, markers=1)
 
 
 def _grips(rotations_deg: list[float], rest: int) -> tuple[Float, Float, Float]:

@@ -1,9 +1,6 @@
 """Kernels under gestures: against numpy, compiled before a hand comes, and of hands that lack a finger."""
 
-import importlib
-import pkgutil
 from dataclasses import replace
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -22,6 +19,7 @@ from master.gestures.features import FeatureExtractor, thumb_touch
 from master.gestures.grip import Tips, rotation_between
 from master.gestures.poses import GestureRecogniser
 from tests.hand_helpers import RIGHT, any_rotation
+from tests.master.fabrik.compiled import compiled
 from tests.master.gestures.shown_hands import FRAME_NS, shown
 
 STILL = np.zeros((5, 4))
@@ -78,7 +76,7 @@ def test_tips_turn_as_they_were_turned() -> None:
 
 def test_no_kernel_is_compiled_while_a_hand_is_tracked() -> None:
     recogniser = GestureRecogniser(default_gestures(), RIGHT)
-    before = compiled()
+    before = compiled(master.gestures)
     assert before["master.gestures.features._measure"] >= 1
     pinch = angles_of(RIGHT, pinch_posture(RIGHT, 2, STILL), STILL)
     poses = [shown(pinch, k * FRAME_NS) for k in range(-30, 0)] + gripping(60)
@@ -87,7 +85,7 @@ def test_no_kernel_is_compiled_while_a_hand_is_tracked() -> None:
     fortran = np.asfortranarray(poses[-1].position_m)
     fortran.flags.writeable = False
     recogniser.push(msgspec.structs.replace(poses[-1], t_ns=60 * FRAME_NS, position_m=fortran))
-    assert compiled() == before
+    assert compiled(master.gestures) == before
 
 
 def test_kernels_are_compiled_once_whether_or_not_a_hand_may_be_written() -> None:
@@ -98,7 +96,7 @@ def test_kernels_are_compiled_once_whether_or_not_a_hand_may_be_written() -> Non
         hand = replace(RIGHT, radius_m=radius)
         assert not hand.radius_m.flags.writeable
         GestureRecogniser(default_gestures(), hand)
-        counts.append(compiled())
+        counts.append(compiled(master.gestures))
     assert counts[0] == counts[1]
 
 
@@ -112,16 +110,3 @@ def test_a_finger_that_is_lost_while_a_dial_turns_leaves_the_dial() -> None:
         angles += [one.angle_rad for one in recogniser.push(lacking) if one.kind == "dial"]
     assert np.isfinite(angles).all()
     assert np.degrees(np.abs(np.diff(angles)).max()) < 4.5
-
-
-def compiled() -> dict[str, int]:
-    """How many types of arguments each kernel of gestures is compiled for."""
-    counts: dict[str, int] = {}
-    for module in pkgutil.iter_modules(master.gestures.__path__, "master.gestures."):
-        kernels: dict[str, Any] = vars(importlib.import_module(module.name))
-        counts |= {
-            f"{module.name}.{name}": len(kernel.signatures)
-            for name, kernel in kernels.items()
-            if hasattr(kernel, "signatures")
-        }
-    return counts

@@ -24,7 +24,7 @@ def theirs(joints_m: Float | None = None) -> Track:
     return Track(ns(THEIRS_S + LATER_S), exact @ ROTATION.T + SHIFT)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_frame_and_clock_are_found_as_well_as_is_said(seed: int) -> None:
     found = align(track_of(noisy(hand_at(OURS_S).position_m, 3e-3, seed), OURS_S), theirs())
     left = found.T_rig_file @ rigid(ROTATION, SHIFT)

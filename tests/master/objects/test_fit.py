@@ -68,7 +68,7 @@ def error(T: Float, truth: Float) -> tuple[float, float]:
     return 1e3 * float(np.linalg.norm(T[:3, 3] - truth[:3, 3])), float(np.degrees(np.linalg.norm(turn)))
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_a_moving_object_is_found_from_unsynchronised_rolling_shutters(seed: int) -> None:
     where = wander(seed, np.array([0.04, 0.0, 0.5]), 0.5, np.pi)
     fit = PoseFit(CameraArrays.of(cameras()), POINTS, BEADS, NO_FLOOR)

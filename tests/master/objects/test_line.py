@@ -104,10 +104,9 @@ def errors(poses: list[ObjectPose], where: Where) -> tuple[Float, Float]:
 
 
 @pytest.mark.parametrize("setup", [WAND, CUBE], ids=["beads", "tags"])
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_moving_object_is_within_three_millimetres_and_two_degrees(setup: Setup, seed: int) -> None:
-    where = about(FLAT if setup is WAND else TOP, seed)
-    poses = run(setup.line(), setup.messages(where, 1.5, seed))
+def test_a_moving_object_is_within_three_millimetres_and_two_degrees(setup: Setup) -> None:
+    where = about(FLAT if setup is WAND else TOP, 1)
+    poses = run(setup.line(), setup.messages(where, 1.5, 1))
     mm, deg = errors(poses, where)
     assert len(poses) == 90
     assert len(mm) >= 88

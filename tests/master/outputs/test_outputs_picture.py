@@ -65,6 +65,18 @@ def draw(
     path: Path, poses: Poses, truth: PosesTruth | None = None, **summary: float
 ) -> npt.NDArray[np.uint8]:
     draw_summary(path, poses, RIG, MODEL, summary, truth)
+    return read(path)
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The picture of one pose, without figures: a picture takes over a second, so what only compares shares this."""
+    path = tmp_path_factory.mktemp("plain") / "hand.png"
+    draw(path, Poses.of([pose()]))
+    return path
+
+
+def read(path: Path) -> npt.NDArray[np.uint8]:
     image = cv2.imread(str(path))
     assert image is not None
     return np.asarray(image, np.uint8)
@@ -75,7 +87,7 @@ def near(image: npt.NDArray[np.uint8], rgb: tuple[int, int, int]) -> int:
     return int((np.abs(image.astype(int) - np.array(rgb[::-1])).max(axis=-1) <= 12).sum())
 
 
-def test_the_picture_shows_a_hand_its_sources_and_its_figures(tmp_path: Path) -> None:
+def test_the_picture_shows_a_hand_its_sources_and_its_figures(tmp_path: Path, plain: Path) -> None:
     poses = Poses.of([pose(i, 0.05 * i) for i in range(8)])
     image = draw(tmp_path / "hand.png", poses, poses_per_s=60.0, latency_p50_ms=8.0)
     assert image.shape == (900, 1600, 3)
@@ -85,32 +97,29 @@ def test_the_picture_shows_a_hand_its_sources_and_its_figures(tmp_path: Path) ->
     assert 0.08 < skin.mean() < 0.7
     assert near(image, SOURCE_RGB[Source.SOLVED]) > 2000  # bones
     assert near(image, SOURCE_RGB[Source.MEASURED]) > 300  # tips
-    without = draw(tmp_path / "bare.png", poses)
     head = slice(0, 110), slice(480, 1600)
     assert (image[head] > 180).sum() > 500
-    assert (without[head] > 180).sum() == 0
+    assert (read(plain)[head] > 180).sum() == 0
 
 
-def test_held_joints_and_the_truth_can_be_seen(tmp_path: Path) -> None:
+def test_held_joints_and_the_truth_can_be_seen(tmp_path: Path, plain: Path) -> None:
     whole = pose()
     source = whole.source.copy()
     source[11:16] = Source.HELD
     held = draw(tmp_path / "held.png", Poses.of([replace(whole, source=source)]))[130:880, 380:990]
-    free = draw(tmp_path / "free.png", Poses.of([whole]))[130:880, 380:990]
+    free = read(plain)[130:880, 380:990]
     # The orange ring of the thumb's marker is in both; the held finger's bones only in one.
     assert near(held, SOURCE_RGB[Source.HELD]) > near(free, SOURCE_RGB[Source.HELD]) + 400
-    poses = Poses.of([whole, pose(1)])
+    poses = Poses.of([whole])
     shifted = PosesTruth(poses.position_m + np.array([0.0, -0.015, 0.0]), poses.markers_m)
     ghost = draw(tmp_path / "ghost.png", poses, shifted)[130:880, 380:990]
-    assert (ghost != draw(tmp_path / "alone.png", poses)[130:880, 380:990]).any(axis=-1).sum() > 500
+    assert (ghost != free).any(axis=-1).sum() > 500
 
 
-def test_the_same_run_gives_the_same_picture(tmp_path: Path) -> None:
-    poses = Poses.of([pose(i) for i in range(3)])
-    draw(tmp_path / "a.png", poses, lost=0.0)
-    draw(tmp_path / "b.png", poses, lost=0.0)
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-    assert (tmp_path / "a.png").read_bytes().startswith(PNG)
+def test_the_same_run_gives_the_same_picture(tmp_path: Path, plain: Path) -> None:
+    draw(tmp_path / "again.png", Poses.of([pose()]))
+    assert (tmp_path / "again.png").read_bytes() == plain.read_bytes()
+    assert plain.read_bytes().startswith(PNG)
 
 
 def test_a_run_without_a_valid_pose_says_so_and_invalid_fingers_are_left_out(tmp_path: Path) -> None:
@@ -122,19 +131,19 @@ def test_a_run_without_a_valid_pose_says_so_and_invalid_fingers_are_left_out(tmp
     assert (blank > 180).sum() > 500  # the sentence
     part = pose().valid.copy()
     part[21:26] = False
+    unseen = np.full((6, 3), np.nan)
     image = draw(
-        tmp_path / "part.png", Poses.of([replace(pose(), valid=part, tracked=pose().tracked & part)])
-    )
+        tmp_path / "part.png",
+        Poses.of([
+            replace(pose(), valid=part, tracked=pose().tracked & part, markers_m=unseen, markers_raw_m=unseen,
+                    latency_ns=0)
+        ]),
+    )  # fmt: skip
     assert near(image, SOURCE_RGB[Source.SOLVED]) > 1000
 
 
-def test_an_empty_run_and_an_unseen_marker_are_drawn(tmp_path: Path) -> None:
-    one = pose()
-    unseen = replace(
-        one, markers_m=np.full((6, 3), np.nan), markers_raw_m=np.full((6, 3), np.nan), latency_ns=0
-    )
-    assert draw(tmp_path / "unseen.png", Poses.of([unseen])).shape == (900, 1600, 3)
-    empty = Poses.of([one]).rows(0, 0)
+def test_an_empty_run_is_drawn(tmp_path: Path) -> None:
+    empty = Poses.of([pose()]).rows(0, 0)
     assert draw(tmp_path / "empty.png", empty).shape == (900, 1600, 3)
 
 
@@ -200,26 +209,24 @@ def test_a_full_disk_is_a_clear_error_and_the_older_picture_stays(
     assert [p.name for p in tmp_path.iterdir()] == ["hand.png"]
 
 
-def test_the_small_view_holds_every_camera_of_a_large_rig_and_its_volume(tmp_path: Path) -> None:
+def test_the_small_view_holds_every_camera_of_a_large_rig_and_its_volume(tmp_path: Path, plain: Path) -> None:
     aside = ((0.0, 0.0, -1.0, 0.55), (1.0, 0.0, 0.0, 0.0), (0.0, -1.0, 0.0, 0.42), EYE[3])
     volume = Volume(low_m=(-0.2, -0.2, 0.4), high_m=(0.2, 0.2, 0.8))
     four = replace(
         RIG, cameras=(*RIG.cameras, "aside"), T_rig_camera=RIG.T_rig_camera | {"aside": aside}, volume=volume
     )
-    poses = Poses.of([pose(0)])
     images: list[npt.NDArray[np.uint8]] = []
-    for name, rig in (("four", four), ("open", replace(four, volume=None)), ("pair", RIG)):
-        draw_summary(tmp_path / f"{name}.png", poses, rig, MODEL, {})
-        image = cv2.imread(str(tmp_path / f"{name}.png"))
-        assert image is not None
-        images.append(np.asarray(image, np.uint8))
+    for name, rig in (("four", four), ("open", replace(four, volume=None))):
+        draw_summary(tmp_path / f"{name}.png", Poses.of([pose()]), rig, MODEL, {})
+        images.append(read(tmp_path / f"{name}.png"))
+    images.append(read(plain))
     with_box, without_box, pair = (image[575:890, 10:370] for image in images)
     assert np.abs(with_box.astype(int) - without_box).max() > 20
     assert np.abs(without_box.astype(int) - pair).max() > 100
     np.testing.assert_array_equal(images[0][:570], images[1][:570])  # nothing of it beyond its panel
 
 
-@pytest.mark.parametrize("count", [4, 8, 9, 10, 14])
+@pytest.mark.parametrize("count", [8, 9, 14])
 def test_no_word_of_the_head_stands_on_another(count: int) -> None:
     keys = [key for key, _, _ in picture._FIGURES]
     assert len(keys) >= count

@@ -29,6 +29,10 @@ def setup(root: Path, request: pytest.FixtureRequest) -> RigSetup:
     return wrist_setup(root, request.param)
 
 
+# A picture takes over a second, and of the other hand it is the same code.
+ONE_HAND = pytest.mark.parametrize("setup", ["wrist"], indirect=True)
+
+
 @pytest.fixture(scope="module")
 def truths(setup: RigSetup) -> list[WristTruth]:
     scene = wrist_scene(setup)
@@ -115,6 +119,7 @@ def test_laser_points_stand_where_they_are_and_where_the_camera_saw_them(
         np.testing.assert_allclose(np.array(detected[k]), now.laser_uv[1:6][there] + 0.5, atol=1e-3)
 
 
+@ONE_HAND
 def test_the_picture_shows_the_device_and_what_its_camera_saw(
     setup: RigSetup, truths: list[WristTruth], tmp_path: Path
 ) -> None:
@@ -139,6 +144,7 @@ def test_the_picture_shows_the_device_and_what_its_camera_saw(
     assert red[100:800, 300:1000].sum() > 500  # the fan
 
 
+@ONE_HAND
 def test_a_pose_of_which_nothing_is_known_can_be_drawn(
     setup: RigSetup, truths: list[WristTruth], tmp_path: Path
 ) -> None:

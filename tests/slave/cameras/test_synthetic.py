@@ -14,6 +14,7 @@ from common.sim.render import Renderer
 from common.sim.scene import Scene
 from slave.cameras.synthetic import SyntheticCamera
 
+pytestmark = pytest.mark.usefixtures("drawn_once")
 ROOT = Path(__file__).resolve().parents[3]
 RIG = load(ROOT / "calib_json/rigs/desk.json", RigCalibration)
 CAMERAS = {name: load(ROOT / f"calib_json/cameras/{name}.json", CameraCalibration) for name in RIG.cameras}

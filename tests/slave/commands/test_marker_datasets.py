@@ -12,7 +12,7 @@ import pytest
 
 from common.arrays import Float
 from common.recording.frame_recording import open_recording
-from slave.commands.offline import calibrate_colours, detect_recording
+from slave.commands.offline import detect_recording
 
 CLEAR_PX2 = 60.0  # a cap of this area is well visible
 
@@ -48,16 +48,6 @@ def truth_of(folder: Path, camera: int, frames: int) -> Truth:
         uv, frac, area = wide
     row = np.minimum(np.arange(frames), len(uv) - 1)
     return Truth(uv[row], frac[row], area[row])
-
-
-@pytest.fixture(scope="module")
-def colours(datasets: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A calib_json tree whose cameras have the colours picked in `calib_colors`."""
-    tree = tmp_path_factory.mktemp("calibration")
-    (tree / "cameras").mkdir()
-    for camera in ("left", "right"):
-        calibrate_colours(datasets / "stereo/calib_colors", camera, tree / "cameras" / f"{camera}.json")
-    return tree
 
 
 @pytest.mark.parametrize("name", RMS_PX)

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import tomllib
+import zipfile
 from importlib import resources
 from pathlib import Path
 
@@ -57,7 +58,6 @@ def test_systemd_has_nothing_to_say_about_the_unit(tmp_path: Path) -> None:
     [
         ("WatchdogSec", "WatchdogSek", "Unknown key 'WatchdogSek'"),
         ("char-i2c", "chor-i2c", "chor-i2c"),
-        ("MemoryMax=70%", "MemoryMax=170%", "Invalid memory limit"),
         ("MemorySwapMax=0", "MemorySwapMax=none", "Invalid memory limit"),
         ("current/bin/phalanx-slave run", "current/bin/phalanx", "not executable"),
     ],
@@ -122,13 +122,7 @@ def test_the_files_of_the_unit_are_in_the_wheel(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=120)
     (wheel,) = tmp_path.glob("*.whl")
-    listed = subprocess.run(
-        [sys.executable, "-m", "zipfile", "-l", str(wheel)],
-        check=True,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    ).stdout
+    listed = zipfile.ZipFile(wheel).namelist()
     assert "slave/install/files/phalanx-slave@.service" in listed
     assert "slave/install/files/phalanx.sysusers.conf" in listed
 

@@ -46,8 +46,10 @@ def separated_hues(a: Float, b: Float) -> float:
     return float(max(abs(d[0] - d[1]), abs(d[2] - d[1])))
 
 
-@pytest.mark.parametrize("kelvin", [3000.0, 3500.0, 4300.0, 5000.0, 5700.0, 6500.0])
-@pytest.mark.parametrize("exposure", [0.7, 1.0, 1.3])
+@pytest.mark.parametrize(
+    ("kelvin", "exposure"),
+    [(3000.0, 0.7), (3000.0, 1.3), (3500.0, 1.0), (4300.0, 1.0), (5700.0, 1.0), (6500.0, 0.7), (6500.0, 1.3)],
+)
 def test_a_whole_hand_proves_its_light(kelvin: float, exposure: float) -> None:
     gains = Light(kelvin, exposure).gains_bgr()
     found = initial_white_balance(under(painted.render(painted.hand()), gains), TABLE, REFERENCE, np.zeros(3))
@@ -60,7 +62,7 @@ def test_a_whole_hand_proves_its_light(kelvin: float, exposure: float) -> None:
 @pytest.mark.parametrize(
     "shown", [*itertools.combinations(range(6), 2), (0, 1, 2), (1, 3, 5), (2, 3, 4), (0, 3, 4)]
 )
-@pytest.mark.parametrize("kelvin", [3000.0, 4300.0, 6500.0])
+@pytest.mark.parametrize("kelvin", [3000.0, 6500.0])
 def test_a_few_markers_prove_the_right_light_or_none(shown: tuple[int, ...], kelvin: float) -> None:
     discs = [d for k, m in enumerate(shown) for d in painted.finger(m, 200.0 + 50 * k, 200.0)]
     gains = Light(kelvin).gains_bgr()
@@ -101,7 +103,7 @@ def test_clutter_in_a_marker_colour_does_not_bend_the_light() -> None:
     ],
     ids=["desk", "skin", *NAMES],
 )
-@pytest.mark.parametrize("kelvin", [3000.0, 4300.0, 6500.0])
+@pytest.mark.parametrize("kelvin", [3000.0, 6500.0])
 def test_one_marker_proves_nothing(discs: list[Disc], kelvin: float) -> None:
     picture = under(painted.render(discs), Light(kelvin).gains_bgr())
     assert not initial_white_balance(picture, TABLE, REFERENCE, np.zeros(3)).proven

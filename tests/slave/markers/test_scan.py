@@ -4,19 +4,20 @@ import importlib.util
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from bench.markers.accuracy import clicks
-from bench.markers.scene import KINDS, sequences
+from bench.markers.scene import KINDS, MarkerFrame, sequences
 from common.arrays import Image
 from common.recording.frame_recording import open_recording
 from common.sim.light import LightSchedule
 from common.sim.render import Renderer
 from slave.cameras.replay import read_png
-from slave.commands.offline import calibrate_colours, camera_of
+from slave.commands.offline import camera_of
 from slave.markers.classify import MAX_CANDIDATES, SCALE, Blob, ColourTable
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.engine import NUMPY, Engine, engine_named
@@ -75,14 +76,12 @@ def assert_same(one: Detections, other: Detections) -> int:
     ],
 )
 def test_every_marker_of_a_recording_is_where_whole_frames_show_it(
-    datasets: Path, tmp_path: Path, name: str, least: int, engine: str
+    datasets: Path, colours: Path, name: str, least: int, engine: str
 ) -> None:
-    (tmp_path / "cameras").mkdir()
     recording = open_recording(datasets / "stereo" / name)
     rig = recording.manifest.marker_rig()
     for side in ("left", "right"):
-        calibrate_colours(datasets / "stereo/calib_colors", side, tmp_path / "cameras" / f"{side}.json")
-        model = camera_of(recording, side, tmp_path)
+        model = camera_of(recording, side, colours)
         seeds = recording.manifest.clicks.get(side)
         whole, windows = (
             detector_for(model, rig.markers, Inline(), seeds, engine_named(engine), rig.free_markers)
@@ -104,13 +103,19 @@ def test_every_marker_of_a_recording_is_where_whole_frames_show_it(
             assert missed == 0
 
 
+@cache
+def drawn(name: str) -> list[list[MarkerFrame]]:
+    kind = KINDS[name]
+    return [list(frames) for frames in sequences(replace(kind, frames=max(kind.frames, 5)), 3, seed=11)]
+
+
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("name", ["finger_end", "blur6", "occluded15", "clutter", "twelve", "320x240"])
 def test_generated_markers_are_the_same(name: str, engine: str) -> None:
     kind = KINDS[name]
     first = MarkerDetector(kind.camera, kind.names, engine=engine_named(engine))
     same = frames = 0
-    for sequence in sequences(replace(kind, frames=max(kind.frames, 5)), 3, seed=11):
+    for sequence in drawn(name):
         pair: tuple[MarkerDetector, MarkerDetector] | None = None
         tracked = [False] * len(kind.names)
         always = np.ones(len(kind.names), np.bool_)

@@ -11,7 +11,6 @@ import pytest
 from common.errors import CameraError
 from slave.__main__ import main
 from slave.cli.table import PROGRAM
-from slave.commands.offline import calibrate_colours
 from slave.markers.detector import MarkerDetector
 from slave.markers.reloadable import CalibratedDetector, ReloadableDetector
 from slave.markers.scan import JUDGED, PROBE_EVERY, PROBES, Scan, ScanChoice
@@ -188,11 +187,9 @@ def test_a_marker_whose_colour_comes_later_is_found_and_without_any_colour_nothi
     assert choice.frames == 2
 
 
-def test_a_recording_gives_the_same_bytes_in_windows(datasets: Path, tmp_path: Path) -> None:
-    (tmp_path / "cameras").mkdir()
-    calibrate_colours(datasets / "stereo/calib_colors", "left", tmp_path / "cameras/left.json")
+def test_a_recording_gives_the_same_bytes_in_windows(datasets: Path, colours: Path, tmp_path: Path) -> None:
     command = ["run", "--name", "left", "--camera", f"replay:{datasets / 'stereo/static'}"]
-    command += ["--calibration", str(tmp_path)]
+    command += ["--calibration", str(colours)]
     for scan in ("full", "windows"):
         assert main([*command, "-o", str(tmp_path / f"{scan}.npz"), "--scan", scan]) == 0
     assert (tmp_path / "full.npz").read_bytes() == (tmp_path / "windows.npz").read_bytes()

@@ -1,6 +1,9 @@
 """The synthetic camera of a wrist device: lit in turn, and a slow process loses whole cycles of the strobe."""
 
+from functools import cache
+
 import numpy as np
+import pytest
 
 from common.recording.frame_recording import Illumination
 from common.sim.board import BoardScene
@@ -12,6 +15,7 @@ from slave.sources import Frame
 from tests.slave.lights.stage import StageClock
 from tests.slave.wrist.wrist_frames import CAMERA, PERIOD_NS, RIG, ROOT
 
+pytestmark = pytest.mark.usefixtures("drawn_once")
 EPOCH_NS = 5_000_000_000_000
 
 
@@ -25,6 +29,7 @@ def read(source: SyntheticCamera) -> Frame:
     return frame
 
 
+@cache
 def wrist_scene() -> WristScene:
     scene = scene_of(ROOT / "calib_json", RIG, "standard", 7)
     assert isinstance(scene, WristScene)

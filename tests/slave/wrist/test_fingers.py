@@ -12,23 +12,21 @@ from common.errors import CalibrationError
 from common.geometry.transforms import axis_rotation
 from common.hand.profiles import mirrored_profile
 from common.recording.frame_recording import Illumination
-from common.sim.wrist.render import WristRenderer
 from slave.wrist.laser import NONE, separate
 from slave.wrist.led_image import WristView
 from slave.wrist.seams import search_bands_of
 from slave.wrist.strobe import lit
-from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW, scene
+from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW, renderer, scene
 
 BLACK = np.zeros((480, 640), dtype=np.uint8)
 
 
 def led_images(name: str, count: int, seed: int) -> list[tuple[float, Image]]:
-    """Differences of LED and ambient frame at instants spread over a scene."""
-    renderer = WristRenderer(scene(name, seed), "wrist")
+    """Differences of LED and ambient frame at times spread over a scene."""
+    device = renderer(name, seed)
     times = [scene(name, seed).period_s * k / count for k in range(count)]
     return [
-        (t, lit(renderer.render(t, Illumination.LED), renderer.render(t, Illumination.AMBIENT)))
-        for t in times
+        (t, lit(device.render(t, Illumination.LED), device.render(t, Illumination.AMBIENT))) for t in times
     ]
 
 

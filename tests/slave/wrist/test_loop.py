@@ -125,17 +125,6 @@ def test_the_time_of_a_cycle_is_that_of_its_three_frames_however_long_there_was_
     assert (metrics["detect_us"], metrics["detect_worst_us"]) == (3000.0, 3000.0)
 
 
-def test_the_loop_ends_when_stopped() -> None:
-    wire, stop = Wire(), threading.Event()
-    stop.set()
-    run(
-        Source(frames([0, 1, 2])),
-        WristPipeline("wrist", wire.session, wire.send, ByNumber().push, DetectionCounters(NAMES)),
-        stop,
-    )
-    assert wire.sent == []
-
-
 def test_real_frames_go_through_the_loop_into_messages() -> None:
     wire, counters = Wire(), DetectionCounters(NAMES)
     detector = WristDetector(VIEW, CAMERA.frame_rate_hz)

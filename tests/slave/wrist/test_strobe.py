@@ -18,9 +18,17 @@ PERIOD_NS = 1e9 / RATE_HZ
 A, L, E = range(3)
 
 
+LIT = 20  # triples
+
+
 @cache
+def all_shown(ambient: str) -> list[Shown]:
+    return rendered(ambient, cycles=LIT, seed=5)
+
+
 def shown(ambient: str = "indoor") -> list[Shown]:
-    return rendered(ambient, cycles=12, seed=5)
+    """The first twelve triples."""
+    return all_shown(ambient)[:36]
 
 
 def frame_of(one: Shown, place: float, seq: int | None = None) -> Frame:
@@ -239,7 +247,6 @@ def test_a_hand_that_leaves_is_out_of_step_once_and_then_unlit() -> None:
     assert (strobe.counts["out_of_step"], strobe.counts["unlit"]) == (1, 9)
 
 
-LIT = 30  # triples
 READABLE = (
     "dark",
     "indoor",
@@ -253,7 +260,7 @@ READABLE = (
 def in_light(name: str) -> list[Image]:
     """The same poses in one light: those of a room, or of an indoor room some times as bright."""
     room, _, times = name.partition(" x ")
-    images = [one.image for one in rendered(room, cycles=LIT, seed=5)]
+    images = [one.image for one in all_shown(room)]
     if not times:
         return images
     own = [image.astype(np.float64) for image in in_light("dark")]
@@ -277,7 +284,7 @@ def in_one_light(light: Callable[[int], str]) -> set[int]:
     return {pose for pose, seen in enumerate(lights) if len(seen) == 1 and seen <= set(READABLE)}
 
 
-@pytest.mark.parametrize("every", [1, 2, 3, LIT // 2])
+@pytest.mark.parametrize("every", [1, 3, LIT // 2])
 @pytest.mark.parametrize("within", [A, L, E])
 @pytest.mark.parametrize(
     "lights",
@@ -309,13 +316,13 @@ def test_light_that_is_switched_costs_no_cycle_but_the_one_it_is_switched_in(
         assert not any(strobe.counts[event] for event in ("gaps", "out_of_step", "unsure", "unlit"))
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_light_that_is_another_in_every_cycle_costs_none(seed: int) -> None:
     lights = np.random.default_rng(seed).choice(READABLE, LIT).tolist()
     assert len(under(lambda k: lights[k // 3])[0]) == LIT
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_light_that_is_another_in_any_frame_makes_no_wrong_cycle(seed: int) -> None:
     names = np.random.default_rng(seed).choice([*READABLE, "indoor x 10", "sun"], 3 * LIT).tolist()
     steady = np.random.default_rng(seed + 100).random(LIT) < 0.5

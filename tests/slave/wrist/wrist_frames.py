@@ -1,6 +1,6 @@
 """Strobed frames of the simulated wrist device, and what a bad camera makes of them."""
 
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -22,23 +22,28 @@ PERIOD_NS = 1e9 / CAMERA.frame_rate_hz
 FIRST_NS = 10**9
 
 
-@cache
 def strobed(name: str, cycles: int, seed: int = 7, start_s: float = 0.0) -> tuple[Frame, ...]:
     """Frames of a scene, three for each triple, labelled with what lit them; nothing that senses may read the label."""
-    renderer = WristRenderer(scene(name, seed), "wrist")
-    frames: list[Frame] = []
-    for seq in range(3 * cycles):
-        t_ns = FIRST_NS + round(seq * PERIOD_NS)
-        lit = STROBE[seq % 3]
-        image = renderer.render(start_s + (t_ns - FIRST_NS) * 1e-9, lit)
-        frames.append(Frame(seq, t_ns, t_ns + 4_000_000, image, lit, 1000.0))
-    return tuple(frames)
+    return tuple(_frame(name, seed, start_s, seq) for seq in range(3 * cycles))
+
+
+@cache
+def _frame(name: str, seed: int, start_s: float, seq: int) -> Frame:
+    t_ns, lit = FIRST_NS + round(seq * PERIOD_NS), STROBE[seq % 3]
+    image = renderer(name, seed).render(start_s + (t_ns - FIRST_NS) * 1e-9, lit)
+    return Frame(seq, t_ns, t_ns + 4_000_000, image, lit, 1000.0)
 
 
 @cache
 def scene(name: str, seed: int = 7) -> WristScene:
     """A scene before the simulated wrist device."""
     return WristScene.by_name(name, RIG, {"wrist": CAMERA}, HAND, seed)
+
+
+@lru_cache(maxsize=4)
+def renderer(name: str, seed: int = 7) -> WristRenderer:
+    """What draws that scene; to make it takes as long as twenty frames."""
+    return WristRenderer(scene(name, seed), "wrist")
 
 
 def spoiled(frames: tuple[Frame, ...], rng: np.random.Generator, share: float) -> list[Frame]:

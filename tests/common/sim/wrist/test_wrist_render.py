@@ -1,6 +1,7 @@
 """Simulated wrist frames: the line is drawn where the truth says, light falls off as light does, the sensor is one."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -20,6 +21,7 @@ CAMERAS = {"wrist": load(CALIB / "cameras/wrist.json", CameraCalibration)}
 RIG = load(CALIB / "rigs/wrist.json", RigCalibration)
 HAND = load(CALIB / "hands/default-right.json", HandProfile)
 AMBIENT, LASER, LED = Illumination.AMBIENT, Illumination.LASER, Illumination.LED
+COARSE = 4  # pixels a side that are looked at together, where the fine picture says no more
 
 
 def scene(name: str, seed: int = 4) -> WristScene:
@@ -39,10 +41,17 @@ def centre_of_line(image: Image, uv: Float) -> float:
     return float((rows * light).sum() / light.sum())
 
 
+@cache
+def curl() -> tuple[WristScene, WristRenderer]:
+    """A curl in a dark room, and what renders it."""
+    shown = scene("curl@dark")
+    return shown, WristRenderer(shown, "wrist")
+
+
 @pytest.mark.parametrize("t_s", [0.8, 2.2, 3.0])
 def test_the_line_is_drawn_where_the_truth_says_to_parts_of_a_pixel(t_s: float) -> None:
-    shown = scene("curl@dark")
-    dim = WristRenderer(shown, "wrist").exposed(60.0, np.full(3, 0.03))  # so that it does not saturate
+    shown, renderer = curl()
+    dim = renderer.exposed(60.0, np.full(3, 0.03))  # so that it does not saturate
     image = dim.render(t_s, LASER)
     bodies = shown.capsules.bodies(shown.truth(t_s).joints)
     curve = shown.sheet.cross(bodies)
@@ -81,7 +90,7 @@ def test_of_one_instant_the_light_is_added_and_a_dark_room_shows_nothing_else() 
 
 
 def test_the_same_instant_is_the_same_picture_and_another_kind_has_other_noise() -> None:
-    one, again = (WristRenderer(scene("poses"), "wrist") for _ in range(2))
+    one, again = (WristRenderer(scene("poses"), "wrist", COARSE) for _ in range(2))
     np.testing.assert_array_equal(one.render(4.0, LED), again.render(4.0, LED))
     ambient, laser = one.render(4.0, AMBIENT), one.render(4.0, LASER)
     corner = np.s_[5:60, 5:60]
@@ -94,7 +103,11 @@ def test_the_same_instant_is_the_same_picture_and_another_kind_has_other_noise()
 )
 def test_a_window_saturates_in_every_room_that_has_one(ambient: str, least: float, most: float) -> None:
     shares = [
-        float((WristRenderer(scene(f"curl@{ambient}", seed), "wrist").render(0.0, AMBIENT) == 255).mean())
+        float(
+            (
+                WristRenderer(scene(f"curl@{ambient}", seed), "wrist", COARSE).render(0.0, AMBIENT) == 255
+            ).mean()
+        )
         for seed in (1, 2, 3)
     ]
     assert least <= min(shares)
@@ -129,7 +142,7 @@ def test_noise_grows_with_light_and_light_is_cut_at_a_byte() -> None:
 
 def test_exposure_and_gain_brighten_and_what_was_prepared_is_shared() -> None:
     shown = scene("curl")
-    renderer = WristRenderer(shown, "wrist")
+    renderer = WristRenderer(shown, "wrist", COARSE)
     brighter = renderer.exposed(4000.0, np.full(3, 2.0))
     before, after = (
         float(np.median(of_light(shown, r, 1.0, LED)[260:, 100:500])) for r in (renderer, brighter)

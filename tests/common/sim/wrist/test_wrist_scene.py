@@ -139,8 +139,7 @@ def test_the_line_on_a_ball_is_the_arc_of_its_slice_that_faces_the_laser() -> No
     assert 0.0 < truth.seen_m[2] <= truth.lit_m[2]
 
 
-@pytest.mark.parametrize("side", ["right", "left"])
-@pytest.mark.parametrize("t_s", [0.4, 7.3, 21.0, 33.3])
+@pytest.mark.parametrize(("side", "t_s"), [("right", 0.4), ("left", 7.3), ("right", 21.0), ("left", 33.3)])
 def test_the_line_is_on_the_plane_on_the_surface_and_in_no_shadow(side: str, t_s: float) -> None:
     shown = scene("standard", side=side)
     sheet = shown.sheet

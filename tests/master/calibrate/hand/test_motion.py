@@ -25,8 +25,9 @@ def run(*options: str) -> str:
     return calibrate("hand", *options)
 
 
-@pytest.mark.parametrize("without", [(), BASES, ("palm", *BASES)])
-@pytest.mark.parametrize("side", ["right", "left"])
+@pytest.mark.parametrize(
+    ("side", "without"), [("right", ()), ("left", ()), ("right", BASES), ("left", ("palm", *BASES))]
+)
 def test_a_hand_comes_back_and_shows_its_side(side: Side, without: tuple[str, ...]) -> None:
     joints = hand_at(T_S, MODELS[side]).position_m @ ROTATION.T + SHIFT
     hand = hand_from_motion(motion_of(joints, T_S, without), "again")

@@ -74,13 +74,21 @@ def rig_of(tree: Path) -> RigCalibration:
     return load(tree / "rigs" / "wrist.json", RigCalibration)
 
 
-def test_a_recording_gives_the_plane_that_the_master_then_uses(
-    tree: Path, boards: Path, tmp_path: Path
-) -> None:
+@pytest.fixture(scope="module")
+def measured(tree: Path, boards: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """Numbers and picture of the plane that is written into the tree, and what the command says."""
+    folder = tmp_path_factory.mktemp("plane")
     output = run(
         "laser-plane", boards, *BOARD, "--rig", "wrist", "--calibration", tree, "--out", tree,
-        "--json", tmp_path / "plane.json", "--picture", tmp_path / "plane.png",
+        "--json", folder / "plane.json", "--picture", folder / "plane.png",
     )  # fmt: skip
+    return folder, output
+
+
+def test_a_recording_gives_the_plane_that_the_master_then_uses(
+    tree: Path, measured: tuple[Path, str]
+) -> None:
+    folder, output = measured
     rig, true = rig_of(tree), plane_of(SEED)
     setup = WristSetup.of(rig, CAMERA, HandModel.of(load(tree / "hands/default-right.json", HandProfile)))
     assert angle_deg(setup.normal, np.array(true.normal)) < 0.1
@@ -91,21 +99,20 @@ def test_a_recording_gives_the_plane_that_the_master_then_uses(
     assert rig.T_camera_palm == RIG.T_camera_palm
     assert "± " in output
     assert "wrote" in output
-    numbers = json.loads((tmp_path / "plane.json").read_text())
+    numbers = json.loads((folder / "plane.json").read_text())
     assert np.array(numbers["covariance_normal_offset_m"]).shape == (4, 4)
-    assert cv2.imread(str(tmp_path / "plane.png")) is not None
+    assert cv2.imread(str(folder / "plane.png")) is not None
 
 
-def test_images_by_name_give_the_same_plane(tree: Path, boards: Path, tmp_path: Path) -> None:
+def test_images_by_name_give_the_same_plane(
+    tree: Path, boards: Path, measured: tuple[Path, str], tmp_path: Path
+) -> None:
     rows = [line.split(",") for line in (boards / FRAMES).read_text().splitlines()[1:]]
     for k, (_, _, _, lit, file) in enumerate(rows):
         shutil.copy(boards / file, tmp_path / f"{k // 3:02d}_{lit}.png")
-    for source in (boards, tmp_path):
-        run(
-            "laser-plane", source, *BOARD, "--rig", "wrist", "--calibration", tree,
-            "--json", tmp_path / f"{source.name}.json",
-        )  # fmt: skip
-    one, other = (json.loads((tmp_path / f"{s.name}.json").read_text()) for s in (boards, tmp_path))
+    numbers = tmp_path / "plane.json"
+    run("laser-plane", tmp_path, *BOARD, "--rig", "wrist", "--calibration", tree, "--json", numbers)
+    one, other = (json.loads(path.read_text()) for path in (measured[0] / "plane.json", numbers))
     assert one["normal"] == other["normal"]
     assert one["offset_mm"] == other["offset_mm"]
 

@@ -36,7 +36,7 @@ def worst_percent(fitted: Float, true: Float) -> float:
     return float(100.0 * np.abs(ratio / np.median(ratio) - 1.0).max())
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_field_comes_back_to_three_per_cent_and_in_the_corners_to_ten(seed: int) -> None:
     found = samples(seed)
     fit = fit_flat_field(found, OPTICS)

@@ -55,7 +55,7 @@ def test_exact_corners_give_the_exact_palm_whichever_end_is_up(rotated: bool) ->
     assert shift < 0.01
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_corners_of_a_tenth_of_a_pixel_give_it_within_a_quarter_degree_and_millimetre(seed: int) -> None:
     fit = palm_from_board([seen_on_palm(0.1, 10 * seed + k) for k in range(3)], BOARD, OFFSET)
     rotation, shift = errors(fit.T_camera_palm)

@@ -1,6 +1,7 @@
 """Who wears a device: knuckles and palm of simulated people are found again, and motions that tell nothing refused."""
 
 import json
+from dataclasses import replace as replaced
 from pathlib import Path
 
 import cv2
@@ -19,9 +20,10 @@ from common.hand.skin import PalmarSurface
 from common.messages import WristDetections
 from common.recording.recorded_files import write_npz
 from master.calibrate.tree_files import matrix_of, provenance
-from master.calibrate.wrist.subject import Subject, calibrate_subject
+from master.calibrate.wrist import subject
+from master.calibrate.wrist.subject import Subject, _check, calibrate_subject
 from master.calibrate.wrist.subject_fit import FLAT, fists_of, guided
-from master.calibrate.wrist.subject_model import UNKNOWN, SubjectModel, Unknown, fitted_profile
+from master.calibrate.wrist.subject_model import MCP, UNKNOWN, SubjectModel, Unknown, fitted_profile
 from master.rig.wrist import WristSetup
 from tests.cli import calibrate
 
@@ -170,33 +172,41 @@ def test_a_motion_without_its_parts_is_refused(seen: Float, match: str) -> None:
         guided(seen)
 
 
-@pytest.mark.parametrize(
-    ("what", "match"),
-    [
-        ("half", "bent at their knuckles to index .* bend them towards 90 deg|never bends straight fingers"),
-        ("fists", "never bends straight fingers at their knuckles"),
-        ("hand", "no likely subject.*hand file that of this hand and side"),
-        ("plane", "no likely subject.*laser plane measured|never|bent at their knuckles"),
-    ],
-)
-def test_what_determines_nothing_or_is_false_is_refused(
-    people: dict[int, Person], motions: dict[int, list[WristDetections]], what: str, match: str
+def test_a_hand_file_of_the_other_side_is_refused(
+    people: dict[int, Person], motions: dict[int, list[WristDetections]]
 ) -> None:
-    person, cycles = people[40], motions[40]
-    rig, hand = person.rig, person.hand
-    if what == "half":  # back from where the knuckles are bent by 40 degrees
-        cycles = cycles[:10] + cycles[10:13] + cycles[27:]
-    elif what == "fists":
-        cycles = cycles[40:] + cycles[40:]
-    elif what == "hand":
-        hand = load(CALIBRATION / "hands" / "default-left.json", HandProfile)
-    else:
-        assert rig.laser_plane is not None
-        rotated = rotation_vector_to_matrix(np.array([0.1, 0.0, 0.0])) @ np.array(rig.laser_plane.normal)
-        x, y, z = rotated.tolist()
-        rig = replace(rig, laser_plane=replace(rig.laser_plane, normal=(x, y, z)))
-    with pytest.raises(FitError, match=match):
-        calibrate_subject(cycles, rig, person.camera, hand)
+    person, hand = people[40], load(CALIBRATION / "hands" / "default-left.json", HandProfile)
+    with pytest.raises(FitError, match=r"no likely subject.*hand file that of this hand and side"):
+        calibrate_subject(motions[40], person.rig, person.camera, hand)
+
+
+def test_a_laser_plane_that_is_six_degrees_off_is_refused(
+    people: dict[int, Person], motions: dict[int, list[WristDetections]]
+) -> None:
+    person, rig = people[40], people[40].rig
+    assert rig.laser_plane is not None
+    rotated = rotation_vector_to_matrix(np.array([0.1, 0.0, 0.0])) @ np.array(rig.laser_plane.normal)
+    x, y, z = rotated.tolist()
+    wrong = replace(rig, laser_plane=replace(rig.laser_plane, normal=(x, y, z)))
+    with pytest.raises(
+        FitError, match=r"no likely subject.*laser plane measured|never|bent at their knuckles"
+    ):
+        calibrate_subject(motions[40], wrong, person.camera, person.hand)
+
+
+def test_a_motion_that_determines_nothing_is_refused(subjects: dict[int, Subject]) -> None:
+    """One without straight fingers that bend, one without a fist, and one that bends them by 40 degrees only."""
+    found = subjects[40]
+    fit, half = found.fit, found.fit.angles_rad.copy()
+    half[..., MCP] = np.minimum(half[..., MCP], np.radians(40.0))
+    _check(fit, found.seen)
+    for wrong, match in (
+        (replaced(fit, fist=np.ones_like(fit.fist)), "never bends straight fingers at their knuckles"),
+        (replaced(fit, fist=np.zeros_like(fit.fist)), "never closes to a fist"),
+        (replaced(fit, angles_rad=half), "bent at their knuckles to index 40, .* bend them towards 90 deg"),
+    ):
+        with pytest.raises(FitError, match=match):
+            _check(wrong, found.seen)
 
 
 def test_a_hand_file_says_how_thick_its_fingers_are(people: dict[int, Person]) -> None:
@@ -220,9 +230,22 @@ def test_a_thickness_that_is_none_is_refused_with_its_key(key: str, value: str) 
 
 
 def test_the_command_writes_rig_and_hand_and_draws(
-    people: dict[int, Person], motions: dict[int, list[WristDetections]], tmp_path: Path
+    people: dict[int, Person],
+    motions: dict[int, list[WristDetections]],
+    subjects: dict[int, Subject],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     person, rows = people[40], motions[40]
+
+    def fitted(cycles: list[WristDetections], rig: RigCalibration, *_: object) -> Subject:
+        """The fit to the same motion, which lasts some seconds."""
+        np.testing.assert_array_equal([one.laser_uv for one in cycles], [one.laser_uv for one in rows])
+        np.testing.assert_array_equal([one.tip_uv for one in cycles], [one.tip_uv for one in rows])
+        assert rig.T_camera_palm == person.rig.T_camera_palm
+        return subjects[40]
+
+    monkeypatch.setattr(subject, "calibrate_subject", fitted)
     for folder, name, value in (
         ("rigs", person.rig.name, person.rig),
         ("cameras", person.camera.name, person.camera),
