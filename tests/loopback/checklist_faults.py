@@ -201,72 +201,61 @@ def _swap(rig: SlavesRig) -> None:
 
 def settle(rig: SlavesRig, quiet_s: float, timeout_s: float = 30.0) -> bool:
     """Wait until the list has been empty for so long."""
-    began = time.monotonic()
-
-    def quiet() -> bool:
-        since = rig.lists.empty_since(began)
-        return since is not None and time.monotonic() - since > quiet_s
-
-    return until(quiet, timeout_s)
+    deadline = time.monotonic() + timeout_s
+    since = time.monotonic()
+    while time.monotonic() < deadline:
+        if rig.lists.now():
+            since = time.monotonic()
+        elif time.monotonic() - since > quiet_s:
+            return True
+        time.sleep(0.05)
+    return False
 
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """What became of faults that were brought about together on the list.
+    """What became of one fault on the list.
 
     Attributes:
-        faults: Which.
-        shown_s, cleared_s: From the last fault to the list that has all of them, from their end to the list that has
-            none of them [s]; None: never.
+        shown_s, cleared_s: From the fault to the list that has it, from its end to the list that has it no more [s];
+            None: never.
         shown_reports, cleared_reports: How many of the master's reports, one a second, came in that time.
-        others: What else was listed from the first fault to the end of what could follow.
-        listed: Their lines.
+        others: What else was listed from the fault to the end of what could follow.
+        subjects: Whom it named.
     """
 
-    faults: tuple[Fault, ...]
+    fault: Fault
     shown_s: float | None
     cleared_s: float | None
     shown_reports: int
     cleared_reports: int
     others: frozenset[Key]
-    listed: frozenset[Key]
-
-    def subjects(self, fault: Fault) -> frozenset[str]:
-        """Whom the lines of one fault named."""
-        return frozenset(subject for code, subject in self.listed if code == fault.code)
+    subjects: frozenset[str]
 
 
-def rehearse(rig: SlavesRig, faults: tuple[Fault, ...], after_s: float = AFTER_S) -> Shown:
-    """Bring them about together and away; wait `after_s` for what may follow."""
-    codes: set[str] = {fault.code for fault in faults}
+def rehearse(rig: SlavesRig, fault: Fault, after_s: float = AFTER_S) -> Shown:
+    """Bring it about and away; wait `after_s` for what may follow."""
     settle(rig, after_s)
-    began = time.monotonic()
-    for fault in faults:
-        fault.put(rig)
-    put, reports = time.monotonic(), rig.lists.reports
-    shown_s = _wait(rig, codes, put, True)
+    fault.put(rig)
+    put = time.monotonic()
+    reports = rig.lists.reports
+    shown_s = _wait(rig, fault, put, True)
     shown_reports = rig.lists.reports - reports
     time.sleep(after_s)
-    listed = frozenset(key for key in rig.lists.now() if key[0] in codes)
-    for fault in reversed(faults):
-        fault.take(rig)
+    subjects = frozenset(subject for code, subject in rig.lists.now() if code == fault.code)
+    fault.take(rig)
     taken, reports = time.monotonic(), rig.lists.reports
-    cleared_s = _wait(rig, codes, taken, False)
+    cleared_s = _wait(rig, fault, taken, False)
     cleared_reports = rig.lists.reports - reports
     time.sleep(after_s)
-    others = {key for _, keys in rig.lists.since(began) for key in keys if key[0] not in codes}
-    return Shown(faults, shown_s, cleared_s, shown_reports, cleared_reports, frozenset(others), listed)
+    others = {key for _, keys in rig.lists.since(put) for key in keys if key[0] != fault.code}
+    return Shown(fault, shown_s, cleared_s, shown_reports, cleared_reports, frozenset(others), subjects)
 
 
-def _wait(rig: SlavesRig, codes: set[str], since: float, there: bool) -> float | None:
-    """Wait until the list has all of these, or none of them; how long that took [s]; None: too long."""
-
+def _wait(rig: SlavesRig, fault: Fault, since: float, there: bool) -> float | None:
     def holds() -> bool:
         lists = rig.lists.since(since)
-        if not lists:
-            return False
-        found = codes & {code for code, _ in lists[-1][1]}
-        return found == (codes if there else set())
+        return bool(lists) and any(code == fault.code for code, _ in lists[-1][1]) == there
 
     return time.monotonic() - since if until(holds, WAIT_S) else None
 
@@ -287,26 +276,22 @@ def reports(lag: Lag) -> int:
 
 def wrong(shown: Shown, reports: int) -> list[str]:
     """In what a rehearsal is not as expected, if so many reports more than nominal are the machine's own doing."""
-    conditions = {
+    told = {
         "never shown": shown.shown_s is None,
         "never gone": shown.cleared_s is None,
-        f"also listed: {set(shown.others)}": not {other for other, _ in shown.others} <= BEHIND,
+        f"of {set(shown.subjects)}": not shown.subjects or not shown.subjects <= shown.fault.subjects,
+        f"also told: {set(shown.others)}": not {other for other, _ in shown.others} <= BEHIND,
         f"shown after {shown.shown_reports} reports": shown.shown_reports > NOMINAL + reports,
         f"gone after {shown.cleared_reports} reports": shown.cleared_reports > NOMINAL + reports,
     }
-    for fault in shown.faults:
-        named = shown.subjects(fault)
-        conditions[f"{fault.code} of {set(named)}"] = not named or not named <= fault.subjects
-    return [what for what, holds in conditions.items() if holds]
+    return [what for what, holds in told.items() if holds]
 
 
-def rehearsed(
-    rig: SlavesRig, fault: Fault, lag: Lag, after_s: float = AFTER_S, beside: tuple[Fault, ...] = ()
-) -> Shown:
-    """Bring a fault about, and those `beside`; once more where it was not as expected and the machine was behind."""
+def rehearsed(rig: SlavesRig, fault: Fault, lag: Lag, after_s: float = AFTER_S) -> Shown:
+    """Bring a fault about; once more where it was not as expected and the machine was behind."""
     for last in (False, False, True):
         lag.late_s.clear()
-        shown = rehearse(rig, (fault, *beside), after_s)
+        shown = rehearse(rig, fault, after_s)
         found = wrong(shown, reports(lag))
         if not found:
             return shown

@@ -23,15 +23,10 @@ from tests.loopback.checklist_faults import (
 from tests.slaves_rig import SlavesRig
 
 FAULTS = {fault.code: fault for fault in of_markers()}
-# Together: three that have nothing to do with each other. The others take a fresh process or a slow way to come about,
-# or are the same path as one of these with another number: tests/nightly has all sixteen, each alone.
-LIVE = (
-    ("auto_mode",),
-    ("background_in_range",),
-    ("camera_moved",),
-    ("packet_loss",),
-    ("imu_silent", "calibration_stale", "too_hot"),
-)
+# The others take a fresh process or a slow way to come about, or are the same path as one of these with another number:
+# tests/nightly has all sixteen.
+LIVE = ("auto_mode", "colour_collision", "background_in_range", "calibration_stale", "camera_moved", "packet_loss",
+        "too_hot", "imu_silent")  # fmt: skip
 BACK_S = 2.0
 AFTER_S = 1.2
 
@@ -56,26 +51,24 @@ def lag() -> Iterator[Lag]:
 def test_nothing_is_reported_while_nothing_is_wrong(rig: SlavesRig, lag: Lag) -> None:
     for last in (False, False, True):
         lag.late_s.clear()
-        conditions = {code for code, _ in clean(rig, 2.0)} - BEHIND
+        conditions = {code for code, _ in clean(rig, 4.0)} - BEHIND
         if not conditions:
             return
         assert not last, conditions
         assert lag.worst_s > BEHIND_S, conditions
 
 
-@pytest.mark.parametrize("codes", LIVE, ids=" ".join)
-def test_a_fault_is_reported_alone_and_goes(codes: tuple[str, ...], rig: SlavesRig, lag: Lag) -> None:
-    first, *others = (FAULTS[code] for code in codes)
-    rehearsed(rig, first, lag, AFTER_S, tuple(others))
+@pytest.mark.parametrize("code", LIVE)
+def test_a_fault_is_reported_alone_and_goes(code: str, rig: SlavesRig, lag: Lag) -> None:
+    rehearsed(rig, FAULTS[code], lag, AFTER_S)
     for key, (sentence, fix) in rig.lists.sentences.items():
-        if key[0] in codes:
+        if key[0] == code:
             assert key[1].split(".")[0].split("-")[0] in sentence
             assert fix
 
 
 def test_a_killed_slave_is_the_only_report_until_it_is_there_again(rig: SlavesRig, lag: Lag) -> None:
-    fault = FAULTS["camera_absent"]
-    assert rehearsed(rig, fault, lag, AFTER_S).subjects(fault) == {"right"}
+    assert rehearsed(rig, FAULTS["camera_absent"], lag, AFTER_S).subjects == {"right"}
 
 
 def test_a_camera_that_is_unplugged_is_reported_by_its_slave_and_is_back_with_the_plug(
@@ -107,36 +100,27 @@ def test_a_camera_that_is_unplugged_is_reported_by_its_slave_and_is_back_with_th
     assert after["poses"] > conditions["poses"]
 
 
-def test_cameras_whose_driver_fails_or_repeats_one_picture_are_absent_until_they_are_well(
-    rig: SlavesRig, lag: Lag
+@pytest.mark.parametrize(("fault", "counted"), [("raises", "camera.raised"), ("frozen", "camera.frozen")])
+def test_a_camera_whose_driver_fails_or_repeats_one_picture_is_absent_until_it_is_well(
+    fault: str, counted: str, rig: SlavesRig, lag: Lag
 ) -> None:
-    """Their slaves live on; what a camera has no new picture of is not measured. Left and right, at the same time."""
+    """Its slave lives on; what it has no new picture of is not measured."""
     until(lambda: not rig.lists.now() - {("rate_low", "left"), ("rate_low", "right")}, 10.0)
     lag.late_s.clear()
-    faults = {"left": ("raises", "camera.raised"), "right": ("frozen", "camera.frozen")}
-    before = {name: rig.ask(name, "report").counts for name in faults}
-    for name, (fault, _) in faults.items():
-        rig.fault(name, **{fault: True})
+    before = rig.ask("left", "report").counts
+    rig.fault("left", **{fault: True})
     began = time.monotonic()
-    absent = {("camera_absent", name) for name in faults}
-    assert until(lambda: absent <= rig.lists.now(), 30.0), rig.lists.now()
+    assert until(lambda: ("camera_absent", "left") in rig.lists.now(), 30.0), rig.lists.now()
     assert time.monotonic() - began < BACK_S + reports(lag)
-    sent = rig.ask(MASTER, "report").counts
-    during = {name: rig.ask(name, "report").counts for name in faults}
-    for name, (_, counted) in faults.items():
-        assert during[name][counted] > before[name][counted]
-        lost = during[name]["camera.lost"]
-        assert until(lambda one=name, n=lost: rig.ask(one, "report").counts["camera.lost"] > n, 30.0)
-    later = rig.ask(MASTER, "report").counts
-    for name in faults:
-        assert later[f"{name}.received"] == sent[f"{name}.received"], (
-            "nothing is measured in the same picture"
-        )
-        rig.fault(name)
-    for name in faults:
-        least = sent[f"{name}.received"] + 3
-        assert until(lambda key=f"{name}.received", n=least: rig.ask(MASTER, "report").counts[key] > n, 30.0)
-    assert until(lambda: not absent & rig.lists.now(), 30.0)
-    for name in faults:
-        assert rig.processes[name].poll() is None
-        assert rig.ask(MASTER, "report").counts.get(f"{name}.restarts", 0) == 0
+    sent = rig.ask(MASTER, "report").counts["left.received"]
+    during = rig.ask("left", "report").counts
+    assert during[counted] > before[counted]
+    assert until(lambda: rig.ask("left", "report").counts["camera.lost"] > during["camera.lost"], 30.0)
+    assert rig.ask(MASTER, "report").counts["left.received"] == sent, (
+        "nothing is measured in the same picture"
+    )
+    rig.fault("left")
+    assert until(lambda: rig.ask(MASTER, "report").counts["left.received"] > sent + 3, 30.0)
+    assert until(lambda: ("camera_absent", "left") not in rig.lists.now(), 30.0)
+    assert rig.processes["left"].poll() is None
+    assert rig.ask(MASTER, "report").counts.get("left.restarts", 0) == 0
