@@ -126,11 +126,11 @@ PRIVATE = frozenset(
         "mounting",
     }
 )
-FIRST_LINE, FILE_LINES = 79, 580
+FIRST_LINE, FILE_LINES = 79, 560
 SHARED = frozenset({"common"})  # nothing enters or leaves the language of both sides
 # No more than there are: each change leaves fewer.
-MODULE_CONSTANTS, PROTOCOLS = 600, 20
-FILES, LINES, FOLDER_FILES = 450, 107_500, 20
+MODULE_CONSTANTS, PROTOCOLS = 590, 11
+FILES, LINES, FOLDER_FILES = 450, 103_000, 20
 # Calls that touch the world; none may run because a module is imported.
 DEVICES = frozenset(
     {
