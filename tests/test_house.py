@@ -126,7 +126,7 @@ PRIVATE = frozenset(
         "mounting",
     }
 )
-FIRST_LINE, FILE_LINES = 79, 560
+FIRST_LINE, FILE_LINES = 79, 580
 SHARED = frozenset({"common"})  # nothing enters or leaves the language of both sides
 # No more than there are: each change leaves fewer.
 MODULE_CONSTANTS, PROTOCOLS = 590, 11

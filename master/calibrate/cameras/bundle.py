@@ -124,10 +124,10 @@ def solve(
 
 
 def lens_prior(bundle: Bundle) -> tuple[Float, Float]:
-    """How far lenses (C, 9) are from ordinary ones, and the standard deviations (C, 9) of these; inf: none.
+    """How far lenses (C, 9) are from ordinary ones, and the widths (C, 9) of these.
 
-    The principal point lies in the middle of the image, to a twentieth of its width; no distortion, to what
-    lenses of 50 to 90 degrees have.
+    Standard deviations; inf: no prior. The principal point lies in the middle of the image, to a twentieth of its
+    width; there is no distortion, to what lenses of 50 to 90 degrees have.
     """
     away = bundle.lenses.copy()
     away[:, :2], away[:, 2:4] = 0.0, bundle.lenses[:, 2:4] - bundle.centre_px
