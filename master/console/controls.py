@@ -150,7 +150,7 @@ class CameraView(Element, component="static/camera_view.js"):
         *,
         pause_ms: int = 0,
     ) -> None:
-        """Show `camera`, to a screen reader as `label`; a picture each `pause_ms` at most.
+        """Show `camera`, to a screen reader as `label`, at most each `pause_ms`.
 
         `on_pick` gets the place in the picture, as shares (0..1) of its width and height, and its time [ns].
         """
