@@ -95,7 +95,7 @@ def look(
 
 
 def _as_printed(board: Board, sets: Sequence[tuple[str, ImageSet]]) -> Board:
-    """The layout of a ChArUco board that some images show; as given where none of them shows it."""
+    """The board in the layout that some images show; as given where none shows it."""
     if not isinstance(board, Charuco):
         return board
     loads = [load for _, images in sets for load in images.values()]
