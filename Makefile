@@ -70,7 +70,7 @@ hosts-tools: emulator ## what the tests with whole machines need; without root i
 	$(call apt,the tests with whole machines,qemu-system-arm qemu-system-x86 qemu-utils systemd-container rsync openssh-client iproute2 tcpdump kmod,qemu-system-aarch64 qemu-system-x86_64 systemd-nspawn rsync ssh ip tcpdump depmod)
 
 # A test that hangs says where each thread stands and takes its worker with it; another worker goes on.
-HANG := -o faulthandler_timeout=600 -o faulthandler_exit_on_timeout=true
+HANG := -o faulthandler_timeout=400 -o faulthandler_exit_on_timeout=true
 
 test: check browser emulator ## check, then all tests; one that fails or hangs is tried once more, and listed
 	@$(BIN)/python -m pytest -n 3 --reruns 1 --dist loadfile --no-loadscope-reorder $(HANG) $(TEST_ARGS)
