@@ -19,6 +19,7 @@ from scipy.sparse import bsr_array, csc_array
 from scipy.sparse.linalg import splu  # pyright: ignore[reportUnknownVariableType]
 
 from common.arrays import Bool, Float, Int
+from common.geometry.transforms import rotation_vector_to_matrix
 
 X = TypeVar("X")
 Loss = Callable[[Float], tuple[Float, Float]]
@@ -205,6 +206,14 @@ class Normal:
         values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
         inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T * scale[:, None] * scale
         return inverse if basis is None else basis @ inverse @ basis.T
+
+
+def stepped_poses(T: Float, step: Float) -> Float:
+    """Poses (..., 4, 4) after steps (..., 6): turned [rad] from the left, moved [m]."""
+    out = T.copy()
+    out[..., :3, :3] = rotation_vector_to_matrix(step[..., :3]) @ T[..., :3, :3]
+    out[..., :3, 3] += step[..., 3:6]
+    return out
 
 
 def _unit_scale(information: Float) -> Float:

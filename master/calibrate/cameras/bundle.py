@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.geometry.transforms import rigid, rotation_vector_to_matrix, skew, transform
-from master.calibrate.adjust import Minimum, Normal, cauchy, minimise
+from common.geometry.transforms import rigid, skew, transform
+from master.calibrate.adjust import Minimum, Normal, cauchy, minimise, stepped_poses
 
 LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 
@@ -235,14 +235,10 @@ def _retracted(bundle: Bundle, shared: Float, own: Float) -> Bundle:
     return replace(
         bundle,
         lenses=bundle.lenses + shared[: 9 * cameras].reshape(cameras, 9),
-        T_camera_rig=np.stack([_rotated(T, s) for T, s in zip(bundle.T_camera_rig, places, strict=True)]),
-        T_rig_board=np.stack([_rotated(T, s) for T, s in zip(bundle.T_rig_board, own, strict=True)]),
+        T_camera_rig=stepped_poses(bundle.T_camera_rig, places),
+        T_rig_board=stepped_poses(bundle.T_rig_board, own),
         shape_m=bundle.shape_m + shared[15 * cameras :].reshape(-1, 3),
     )
-
-
-def _rotated(T: Float, step: Float) -> Float:
-    return rigid(rotation_vector_to_matrix(step[:3]) @ T[:3, :3], T[:3, 3] + step[3:])
 
 
 def _solution(

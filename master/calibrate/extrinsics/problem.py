@@ -27,7 +27,7 @@ from common.arrays import Float
 from common.geometry.transforms import rotation_vector_to_matrix, skew
 from common.hand.model import Chains, HandModel
 from common.hand.wrist import wrist_angles_of
-from master.calibrate.adjust import Normal, cauchy, minimise
+from master.calibrate.adjust import Normal, cauchy, minimise, stepped_poses
 from master.calibrate.extrinsics.tracks import (
     FINGERS,
     SEEN,
@@ -69,10 +69,7 @@ class Hands:
 
     def retracted(self, step: Float) -> "Hands":
         """After steps (T, 6 + n): rotation [rad], shift [m], both rig axes; angles [rad]."""
-        T = self.T_rig_palm.copy()
-        T[:, :3, :3] = rotation_vector_to_matrix(step[:, :3]) @ T[:, :3, :3]
-        T[:, :3, 3] += step[:, 3:6]
-        return Hands(T, self.x + step[:, 6:])
+        return Hands(stepped_poses(self.T_rig_palm, step[:, :6]), self.x + step[:, 6:])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,9 +22,9 @@ from common.arrays import Bool, Float, Int
 from common.calibration import RigCalibration
 from common.errors import CalibrationError, FitError
 from common.geometry.camera_model import CameraModel
-from common.geometry.transforms import fit_rigid, rotation_vector_to_matrix, skew, transform
+from common.geometry.transforms import fit_rigid, skew, transform
 from common.messages import HandPose, MarkerDetections
-from master.calibrate.adjust import Loss, Normal, geman_mcclure, minimise
+from master.calibrate.adjust import Loss, Normal, geman_mcclure, minimise, stepped_poses
 from master.estimator.sensors import CameraArrays
 from master.fabrik.caps import LensShift
 from master.fabrik.depth import CalibrationResidual
@@ -230,10 +230,7 @@ def _equations(seen: Seen, whiten: Float, loss: Loss, body: _Body) -> Normal:
 
 
 def _stepped(body: _Body, shared: Float, own: Float) -> _Body:
-    T = body.T.copy()
-    T[:, :3, :3] = rotation_vector_to_matrix(own[:, :3]) @ T[:, :3, :3]
-    T[:, :3, 3] += own[:, 3:]
-    return _Body(body.beads_m + shared.reshape(-1, 3), T)
+    return _Body(body.beads_m + shared.reshape(-1, 3), stepped_poses(body.T, own))
 
 
 def first_body(seen: Seen) -> tuple[Float, Float]:

@@ -238,9 +238,13 @@ class _Problem:
         """Residuals (N,) in sigmas of six dimensions."""
         return np.linalg.norm((self.whiten @ off[..., None])[..., 0], axis=1)
 
-    def equations(self, placed: Placed, scale: float, share: Float | float = 1.0) -> Normal:
+    def equations(self, placed: Placed, scale: float) -> Normal:
         """Normal equations of the registration, with all sigmas scaled."""
-        rows, whiten, normal = self.rows(placed), self.whiten / scale, Normal(_UNKNOWNS)
+        return self.normal(self.rows(placed), scale)
+
+    def normal(self, rows: _Rows, scale: float, share: Float | float = 1.0) -> Normal:
+        """The same of linearised equations, of which a share (N,) counts."""
+        whiten, normal = self.whiten / scale, Normal(_UNKNOWNS)
         normal.add(
             (whiten @ -rows.off[..., None])[..., 0],
             whiten @ rows.jacobian,
@@ -269,14 +273,14 @@ def fit_registration(seen: PoseTrack, tracker: PoseTrack, first: Placed) -> Fit:
     # Again, because the lag decides which epochs are known.
     problem = _Problem(seen, tracker, shared_epochs(seen, tracker, better.late_s, most))
     placed, scale = _refined(problem, better)
-    rows, normal = problem.rows(placed), problem.equations(placed, scale)
+    rows = problem.rows(placed)
     changes: list[Float] = []  # of the unknowns when a block of time is omitted, by one step
     for block in _blocks(problem.t_s):
-        step = problem.equations(placed, scale, np.where(block, 0.0, 1.0)).step(0.0)
+        step = problem.normal(rows, scale, np.where(block, 0.0, 1.0)).step(0.0)
         changes.append(np.zeros(_UNKNOWNS) if step is None else step[0])
     return Fit(
         placed, problem.middle_m, problem.t_s, rows.R, rows.p_m, rows.off,
-        problem.sizes(rows.off) / scale > OUTLIER, scale, normal.covariance(), np.array(changes),
+        problem.sizes(rows.off) / scale > OUTLIER, scale, problem.normal(rows, scale).covariance(), np.array(changes),
     )  # fmt: skip
 
 
