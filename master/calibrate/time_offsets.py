@@ -8,28 +8,21 @@ offset, so the recording is measured again, and a third time, with the stamps as
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
-from common.calibration import CameraCalibration, RigCalibration, load
-from common.command_line import echo
+from common.calibration import RigCalibration
 from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections
-from common.recording.frame_recording import FrameRecording, open_recording
-from master.calibrate.tree_files import (
-    load_marker_rig,
-    print_lines,
-    provenance,
-    rig_in_tree,
-    write_report,
-    write_rig,
-)
+from master.calibrate.observations import recorded_motion
+from master.calibrate.report import Column, Table, finish
+from master.calibrate.tree_files import provenance, rig_in_tree, write_into_rig
 from master.monitor.clocks import ResidualTiming
 from master.monitor.timing_fit import TimeOffset
-from master.replay.recorded import recorded_detections
 
 SIGNIFICANT = 3.0  # standard deviations
 _ADVICE = (
@@ -136,94 +129,38 @@ def _motion(
 
 def time_command(options: Namespace) -> None:
     """Measure how much later frames are than their stamps, from a moving hand."""
-    opened = open_recording(options.recording)
-    used, cameras = geometry_of(opened, options.rig, options.calibration)
-    base = rig_in_tree(options.out, options.rig or used.name, used)
-    times = measure(opened, used, cameras, options.detections)
-    print_lines(report_lines(used, times))
-    written: Path | None = None
-    if options.out is None:
-        echo("nothing written: give --out DIR")
-    else:
-        written = write_offsets(
-            options.out, options.rig or used.name, base, times, options.recording.resolve().name
+    motion = recorded_motion(options.recording, options.detections, options.rig, options.calibration)
+    rig = motion.rig
+    file_name = options.rig or rig.name
+    rig_in_tree(options.out, file_name, rig)  # refused before anything is measured
+    times = measure_times(motion.models, motion.rates_hz, motion.messages)
+
+    def write(out: Path) -> dict[Path, str]:
+        residual = {f"{time.camera}_sigma_us": round(1e-3 * time.offset.sigma_ns, 1) for time in times}
+        how = provenance("calibrate time", (motion.data,), residual, f"against {rig.cameras[0]}")
+        offsets = {time.camera: time.to_write_us for time in times}
+        return write_into_rig(out, file_name, rig, {"stamp_offset_us": how}, stamp_offset_us=offsets)
+
+    lines = offsets_table(rig, times).lines()
+    finish(options, lines, report_json(rig, times), partial(draw_times, rig=rig, times=times), write)
+
+
+def offsets_table(rig: RigCalibration, times: Sequence[CameraTime]) -> Table:
+    """Offset of each camera and how surely it is known."""
+    right = f"within {SIGNIFICANT:g} standard deviations of 0: its stamps are right"
+    notes = ["reference", *("" if time.significant else right for time in times)]
+    ms = np.array([[0.0, 0.0], *([time.offset.offset_ns, time.offset.sigma_ns] for time in times)]) * 1e-6
+    return Table(
+        (
+            Column("camera", rig.cameras),
+            Column("later than its stamps", ms[:, 0], "+.3f", "ms"),
+            Column("standard deviation", ms[:, 1], ".3f", "ms"),
+            Column(" ", notes),
         )
-        echo(f"wrote {written}: stamp_offset_us")
-    write_report(options.json_file, report_json(used, times), written)
+    )
 
 
-def geometry_of(
-    recording: FrameRecording, rig: str | None, calibration: Path
-) -> tuple[RigCalibration, dict[str, CameraCalibration]]:
-    """Rig and cameras: the recording's own, or those of a calibration tree.
-
-    Raises:
-        RecordingError: The recording has no marker rig.
-        CalibrationError: A file of the tree is missing or broken, or the recording lacks one of its cameras.
-    """
-    if rig is None:
-        own = recording.manifest.marker_rig()
-        return own, {name: recording.manifest.cameras[name] for name in own.cameras}
-    named = load_marker_rig(calibration, rig)
-    for name in named.cameras:
-        if name not in recording.manifest.cameras:
-            raise CalibrationError(f"{recording.folder}: no camera {name!r}, which rig {rig!r} has")
-    return named, {
-        name: load(calibration / "cameras" / f"{name}.json", CameraCalibration) for name in named.cameras
-    }
-
-
-def measure(
-    recording: FrameRecording, rig: RigCalibration, cameras: Mapping[str, CameraCalibration], detections: Path
-) -> tuple[CameraTime, ...]:
-    """Offsets of the cameras of a recording, by their stamps as they were recorded.
-
-    Raises:
-        RecordingError: A detections file is missing or broken.
-        CalibrationError: A camera has no intrinsics, it is not one motion, or there is too little of it.
-    """
-    if not recording.manifest.continuous:
-        raise CalibrationError(
-            f"{recording.folder}: its frames are unrelated poses (continuous is false): a time offset needs motion"
-        )
-    if len(rig.cameras) < 2:
-        raise CalibrationError(f"rig {rig.name!r}: cameras: two or more are needed")
-    models = {name: CameraModel.of(cameras[name], rig.camera_pose(name)) for name in rig.cameras}
-    rates = {name: cameras[name].frame_rate_hz for name in rig.cameras}
-    return measure_times(models, rates, detections_of(rig, detections))
-
-
-def detections_of(rig: RigCalibration, detections: Path) -> list[MarkerDetections]:
-    """Recorded detections of a rig's cameras, by their stamps.
-
-    Raises:
-        RecordingError: A detections file is missing or broken.
-    """
-    messages = [
-        message for name in rig.cameras for message in recorded_detections(detections, name, len(rig.markers))
-    ]
-    return sorted(messages, key=lambda message: message.t_ns)
-
-
-def report_lines(rig: RigCalibration, times: tuple[CameraTime, ...]) -> list[str]:
-    """The table for a person."""
-    width = max(len("camera"), *(len(name) for name in rig.cameras))
-    lines = [
-        f"{'camera':{width}}  later than its stamps   standard deviation",
-        f"{rig.cameras[0]:{width}}  reference",
-    ]
-    for time in times:
-        offset, sigma = 1e-6 * time.offset.offset_ns, 1e-6 * time.offset.sigma_ns
-        note = (
-            ""
-            if time.significant
-            else f"   within {SIGNIFICANT:g} standard deviations of 0: its stamps are right"
-        )
-        lines.append(f"{time.camera:{width}}  {offset:+18.3f} ms   {sigma:15.3f} ms{note}")
-    return lines
-
-
-def report_json(rig: RigCalibration, times: tuple[CameraTime, ...]) -> dict[str, object]:
+def report_json(rig: RigCalibration, times: Sequence[CameraTime]) -> dict[str, object]:
     """The same for programs [us]."""
     return {
         "rig": rig.name,
@@ -234,19 +171,19 @@ def report_json(rig: RigCalibration, times: tuple[CameraTime, ...]) -> dict[str,
     }
 
 
-def write_offsets(
-    out: Path, file_name: str, rig: RigCalibration, times: tuple[CameraTime, ...], data: str
-) -> Path:
-    """Write rigs/<file_name>.json with the offsets (noise as 0) and their provenance.
+def draw_times(path: Path, rig: RigCalibration, times: Sequence[CameraTime]) -> None:
+    """Draw each camera's offset with its three standard deviations."""
+    from master.calibrate.picture import BLUE, GREY, figure_of, save_figure  # matplotlib, for a picture alone
 
-    Raises:
-        CalibrationError: The file cannot be written; the old one is untouched.
-    """
-    residual = {f"{time.camera}_sigma_us": round(1e-3 * time.offset.sigma_ns, 1) for time in times}
-    how = provenance("calibrate time", (data,), residual, f"against {rig.cameras[0]}")
-    new = msgspec.structs.replace(
-        rig,
-        stamp_offset_us={time.camera: time.to_write_us for time in times},
-        provenance=rig.provenance | {"stamp_offset_us": how},
-    )
-    return write_rig(out, file_name, new)
+    figure = figure_of((8.0, 1.6 + 0.5 * len(times)))
+    axes = figure.subplots()
+    for row, time in enumerate(times):
+        ms, sigma = 1e-6 * time.offset.offset_ns, 1e-6 * time.offset.sigma_ns
+        colour = BLUE if time.significant else GREY
+        axes.errorbar(ms, row, xerr=SIGNIFICANT * sigma, fmt="o", capsize=4, color=colour)
+    axes.axvline(0.0, color=GREY, linewidth=0.8)
+    axes.set_yticks(range(len(times)), [time.camera for time in times])
+    axes.set_ylim(-0.8, len(times) - 0.2)
+    against = f"later than its stamps, against {rig.cameras[0]} [ms], ± {SIGNIFICANT:g} standard deviations"
+    axes.set(xlabel=against, title="blue: corrected; grey: right as it is")
+    save_figure(figure, path)

@@ -4,12 +4,12 @@ Which rig file gets a result, its provenance, and the conversion between fit arr
 written whole or not at all; numbers are rounded as they are written.
 """
 
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Mapping
 from contextlib import contextmanager
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+from msgspec.structs import replace
 
 from common.arrays import Float
 from common.calibration import (
@@ -23,16 +23,12 @@ from common.calibration import (
     load,
     save,
 )
+from common.calibration.files import date_now
 from common.calibration.object_profile import ObjectProfile
 from common.command_line import echo
 from common.errors import CalibrationError, FitError
 from common.geometry.camera_model import CameraModel
 from master.commands.summary import write_summary
-
-
-def date_now() -> str:
-    """The wall clock's date and time as files state it: UTC, to the second."""
-    return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def provenance(tool: str, data: tuple[str, ...], residual: dict[str, float], note: str = "") -> Provenance:
@@ -108,6 +104,24 @@ def _write(path: Path, value: RigCalibration | CameraCalibration | HandProfile |
         raise CalibrationError(f"--out: cannot make the folder {path.parent}: {error.strerror}") from error
     save(path, value)
     return path
+
+
+def write_into_rig(
+    out: Path, file_name: str, rig: RigCalibration, how: Mapping[str, Provenance], **values: object
+) -> dict[Path, str]:
+    """Write `values` of some keys into rigs/<file_name>.json of the tree `out`, and how they were measured.
+
+    The file there is kept but for these keys; where there is none, a new one is like `rig`.
+
+    Returns:
+        Its path, and the keys.
+
+    Raises:
+        CalibrationError: As `rig_in_tree` and `write_rig`.
+    """
+    there = rig_in_tree(out, file_name, rig)
+    new = replace(there, provenance=there.provenance | dict(how), **values)
+    return {write_rig(out, file_name, new): ", ".join(values)}
 
 
 def print_lines(lines: Iterable[str]) -> None:

@@ -238,8 +238,7 @@ def time(command: ArgumentParser) -> None:
     add_path(command, "--detections", "DIR", "folder with detections_<camera>.npz of it", required=True)
     add_recording_rig(command)
     add_calibration(command, "rigs/ and cameras/, for --rig")
-    add_out(command)
-    add_json(command)
+    add_results(command, "the offsets")
 
 
 def hand(command: ArgumentParser) -> None:

@@ -20,6 +20,7 @@ from common.arrays import Image
 from common.bus.bus import Bus, Subscription
 from common.bus.keys import link_key
 from common.calibration import CameraCalibration, RigCalibration, load
+from common.calibration.files import date_now
 from common.clock import SystemClock, now_ns
 from common.command_line import echo
 from common.errors import BusError, CalibrationError, PictureError
@@ -28,7 +29,6 @@ from common.messages.picture_size import Size
 from common.recording.pictures import decode
 from master.calibrate.cameras.boards import board_in, options_of
 from master.calibrate.cameras.coverage import LiveViews, Verdict
-from master.calibrate.tree_files import date_now
 from master.commands.options import address
 from master.run.ingest import Ingest
 from master.run.process import host_bus, stop_on_signals

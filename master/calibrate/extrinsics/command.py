@@ -16,7 +16,7 @@ from common.imu.fusion import OrientationFilter
 from common.messages import HandPose, ImuSample
 from common.recording.frame_recording import FrameRecording, open_recording
 from master.calibrate.extrinsics.extrinsics import Extrinsics, calibrate_extrinsics, left_of
-from master.calibrate.time_offsets import detections_of
+from master.calibrate.observations import detections_of
 from master.calibrate.tree_files import print_lines, refusals_named, write_report
 from master.calibrate.wrist.device import device_of, write_device
 from master.replay.recorded import recorded_cycles

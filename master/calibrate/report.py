@@ -1,0 +1,126 @@
+"""Report a calibration: lines for a person, figures for programs, a picture, files.
+
+Every calibration ends by `finish`. A `Table` is made once, and read by a person as lines, by programs as JSON.
+"""
+
+from argparse import Namespace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+from pathlib import Path
+
+import numpy as np
+
+from common.arrays import Float, Int
+from common.command_line import echo
+from master.calibrate.tree_files import print_lines
+from master.commands.summary import write_summary
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Column:
+    """One quantity of a table.
+
+    Attributes:
+        title: Its heading; empty: not printed.
+        values: (N,) numbers, NaN where unknown, or texts.
+        form: How a number is printed, such as "8.2f"; empty: texts.
+        unit: Printed behind a number.
+        key: Its key in JSON, with the unit; what follows a dot is a key of an object in there. Empty: not in JSON.
+        foot: Numbers below, in the rows of `Table.foot`.
+    """
+
+    title: str
+    values: Float | Int | Sequence[str]
+    form: str = ""
+    unit: str = ""
+    key: str = ""
+    foot: Sequence[float] = ()
+
+    def cells(self) -> list[str]:
+        """Heading, rows and foot, equally wide."""
+        texts = [self.title, *(self._text(one) for one in [*self.values, *self.foot])]
+        width, side = max(map(len, texts)), ">" if self.form else "<"
+        return [f"{text:{side}{width}s}" for text in texts]
+
+    def _text(self, value: float | str) -> str:
+        if isinstance(value, str):
+            return value
+        return "-" if np.isnan(value) else f"{value:{self.form}} {self.unit}".rstrip()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Table:
+    """Columns of equal length; `foot` names the rows below, such as "mean |error|"."""
+
+    columns: Sequence[Column]
+    foot: Sequence[str] = ()
+
+    def lines(self) -> list[str]:
+        """Heading, rows and foot for a person."""
+        shown = [column for column in self.columns if column.title]
+        rows = [list(row) for row in zip_longest(*(column.cells() for column in shown), fillvalue="")]
+        free = next((i for i, column in enumerate(shown) if column.foot), 0)
+        width = len("  ".join(rows[0][:free]))
+        for title, row in zip(self.foot, rows[len(rows) - len(self.foot) :], strict=True):
+            row[:free] = [f"{title:{width}s}"]
+        return ["  " + "  ".join(row).rstrip() for row in rows]
+
+    def json(self) -> list[dict[str, object]]:
+        """One object for each row; null: unknown."""
+        rows = [dict[str, object]() for _ in self.columns[0].values]
+        for column in self.columns:
+            parent, _, child = column.key.partition(".")
+            for row, value in zip(rows, column.values, strict=True):
+                if child:
+                    within = row.setdefault(parent, dict[str, object]())
+                    assert isinstance(within, dict)
+                    within[child] = plain(value)
+                elif parent:
+                    row[parent] = plain(value)
+        return rows
+
+
+def plain(value: object) -> object:
+    """A value as JSON has it: numbers of Python, null for NaN, lists for arrays."""
+    if isinstance(value, np.ndarray):
+        return [plain(one) for one in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+Write = Callable[[Path], Mapping[Path, str]]
+"""Writes files into a tree, and returns for each what was written."""
+
+
+def finish(
+    options: Namespace,
+    lines: Iterable[str],
+    numbers: dict[str, object],
+    draw: Callable[[Path], None] | None,
+    write: Write,
+) -> None:
+    """End a calibration: print it, draw its picture, write its files and its figures.
+
+    Args:
+        options: `out`, `json_file` and `picture` of the command line, each may be None.
+        lines: The report for a person.
+        numbers: The same for programs; "written" is added, the paths of the files.
+        draw: Draws the picture; None: there is none.
+        write: Called with `out`.
+
+    Raises:
+        CalibrationError, RecordingError: A file cannot be written.
+    """
+    print_lines(lines)
+    if draw is not None and options.picture is not None:
+        draw(options.picture)
+        echo(f"drew {options.picture}")
+    written = {} if options.out is None else write(options.out)
+    for path, what in written.items():
+        echo(f"wrote {path}: {what}")
+    if options.out is None:
+        echo("nothing written: give --out DIR")
+    if options.json_file is not None:
+        write_summary(options.json_file, numbers | {"written": [str(path) for path in written]})
