@@ -73,6 +73,13 @@ class Observations:
         return Observations(self.names, self.by, self.t_ns[epochs], self.value[epochs], self.cov[epochs])
 
 
+def thinned(rows: Int, most: int) -> Int:
+    """At most so many of the rows (N,), evenly spread."""
+    return (
+        rows if len(rows) <= most else rows[np.unique(np.linspace(0, len(rows) - 1, most).astype(np.int64))]
+    )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedMotion:
     """Something that moved before the cameras of a rig, as it was recorded."""

@@ -1,7 +1,7 @@
 """Draw the result of a calibration, and save it as one picture.
 
-One PNG shows what was seen, and what was fitted to it: laser plane, flat field, curls, subject, object, registration
-or pose of the device. Every `draw_...` raises RecordingError where the file cannot be written.
+One PNG shows what was seen, and what was fitted to it. Every `draw_...` raises RecordingError where the file cannot be
+written.
 """
 
 from collections.abc import Sequence
@@ -13,17 +13,14 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from common.arrays import Bool, Float
 from common.calibration.files import replacing
-from common.calibration.object_profile import ObjectProfile
 from common.calibration.rig import field_at
 from common.errors import RecordingError
 from common.geometry.camera_model import CameraModel
-from common.geometry.transforms import fit_rigid
 
 if TYPE_CHECKING:
     from master.calibrate.extrinsics.extrinsics import Extrinsics
-    from master.calibrate.object.measure import Measurement
-    from master.calibrate.tracker.registration import Registration
     from master.calibrate.wrist.curl import FingerCurl
     from master.calibrate.wrist.flat_field import FlatFit, WhiteSamples
     from master.calibrate.wrist.plane import PlaneFit, ViewLine
@@ -51,7 +48,7 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 FINGER_COLOURS = ("#c2571a", "#2b6cb0", "#2f855a", "#805ad5", "#b7791f")
-BLUE, ORANGE, GREY = "#2b6cb0", "#c2571a", "#8a8a8a"
+BLUE, ORANGE, GREEN, GREY = "#2b6cb0", "#c2571a", "#2f855a", "#8a8a8a"
 
 
 def draw_plane(path: Path, fit: "PlaneFit", lines: "Sequence[ViewLine]", optics: CameraModel) -> None:
@@ -156,73 +153,22 @@ def draw_subject(path: Path, found: "Subject", optics: CameraModel) -> None:
     save_figure(figure, path)
 
 
-def draw_object(path: Path, found: "Measurement", profile: ObjectProfile) -> None:
-    """Draw beads and observations in the object's frame, and residuals over time."""
-    bundle, own = found.bundle, np.array([profile.markers[name].position_m for name in found.names])
-    # Where each observation lies in the object: the bead less its residual, turned into its frame.
-    rotation = fit_rigid(own, bundle.beads_m)[:3, :3]
-    left = np.einsum("ij,tkj,tbk->tbi", rotation, bundle.T[:, :3, :3], bundle.off_m)
-    figure = figure_of((16.0, 8.4))
-    figure.suptitle(f"{profile.name}: {len(bundle.T)} epochs in {found.looks} ways of turning and places")
-    *sides, time = figure.subplots(2, 2).ravel()
-    for axes, (a, b) in zip(sides, ((0, 1), (0, 2), (1, 2)), strict=True):
-        for row, name in enumerate(found.names):
-            colour = FINGER_COLOURS[row % len(FINGER_COLOURS)]
-            seen = 1e3 * (own[row] - left[:, row])
-            axes.plot(seen[:, a], seen[:, b], ".", markersize=2, color=colour, alpha=0.5)
-            axes.plot(*1e3 * own[row, [a, b]], "+", markersize=12, color="black")
-            axes.annotate(name, 1e3 * own[row, [a, b]], textcoords="offset points", xytext=(6, 6))
-        axes.set(title=f"object {'xyz'[a]}, {'xyz'[b]} [mm]")
-        axes.set_aspect("equal", adjustable="datalim")
-    for row, name in enumerate(found.names):
-        colour = FINGER_COLOURS[row % len(FINGER_COLOURS)]
-        size = 1e3 * np.linalg.norm(bundle.off_m[:, row], axis=1)
-        outlier = bundle.outlier[:, row]
-        time.plot(
-            bundle.seen.t_s, np.where(outlier, np.nan, size), ".", markersize=3, color=colour, label=name
-        )
-        time.plot(bundle.seen.t_s[outlier], size[outlier], "x", markersize=4, color=GREY)
-    time.set(title="from the rigid body [mm]; crosses: outliers", xlabel="time [s]")
-    time.set_ylim(0.0, max(1.0, 1.2 * float(np.nanpercentile(1e3 * np.abs(bundle.off_m), 99.0)) * 1.7))
-    time.legend(fontsize=8, markerscale=3)
-    save_figure(figure, path)
-
-
-_GREEN = "#2f855a"
-
-
-def draw_registration(path: Path, found: "Registration") -> None:
-    """Draw the object's path (dots: cameras; lines: tracker), and offsets over time."""
-    fit = found.fit
-    figure = figure_of((17.0, 8.4))
-    figure.suptitle("\n".join(found.report[:2]))
-    above, side, place, rotation = figure.subplots(2, 2).ravel()
-    seen = 1e3 * (fit.p_m + fit.off[:, :3])
-    track_mm = 1e3 * fit.p_m.copy()
-    track_mm[np.diff(fit.t_s, prepend=fit.t_s[0]) > 0.2] = np.nan  # a gap is no way
-    for axes, (a, b), title in ((above, (0, 2), "from above [mm]"), (side, (2, 1), "from the side [mm]")):
-        axes.plot(track_mm[:, a], track_mm[:, b], "-", color=GREY, linewidth=0.8, label="tracker")
-        axes.plot(
-            seen[~fit.outlier, a], seen[~fit.outlier, b], ".", color=BLUE, markersize=3, label="cameras"
-        )
-        axes.plot(
-            seen[fit.outlier, a], seen[fit.outlier, b], "x", color=ORANGE, markersize=4, label="outlier"
-        )
-        axes.set(title=f"{title}: rig {'xyz'[a]}, {'xyz'[b]}")
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.legend(fontsize=8)
-    side.invert_yaxis()  # y of the rig points down
-    for axes, columns, unit, title in (
-        (place, slice(0, 3), 1e3, "cameras against tracker: place [mm]"),
-        (rotation, slice(3, 6), np.degrees(1.0), "cameras against tracker: turn [deg]"),
-    ):
-        left = unit * np.where(fit.outlier[:, None], np.nan, fit.off[:, columns])
-        for values, colour, name in zip(left.T, (BLUE, ORANGE, _GREEN), "xyz", strict=True):
-            axes.plot(fit.t_s, values, ".", color=colour, markersize=3, label=name)
-        axes.axhline(0.0, color=GREY, linewidth=0.8)
-        axes.set(title=title, xlabel="time [s]")
-        axes.legend(fontsize=8)
-    save_figure(figure, path)
+def draw_over_time(
+    axes: Axes,
+    t_s: Float,
+    values: Float,
+    outlier: Bool,
+    names: Sequence[str],
+    colours: Sequence[str] = FINGER_COLOURS,
+) -> None:
+    """Draw series (T, N) over time [s]; outliers (T,) or (T, N) are crosses."""
+    beyond = np.broadcast_to(outlier.reshape(len(t_s), -1), values.shape)
+    for column, name in enumerate(names):
+        colour, off = colours[column % len(colours)], beyond[:, column]
+        axes.plot(t_s[~off], values[~off, column], ".", markersize=3, color=colour, label=name)
+        axes.plot(t_s[off], values[off, column], "x", markersize=4, color=GREY)
+    axes.set(xlabel="time [s]")
+    axes.legend(fontsize=8, markerscale=3)
 
 
 def draw_extrinsics(path: Path, found: "Extrinsics", optics: CameraModel) -> None:

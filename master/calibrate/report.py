@@ -1,4 +1,4 @@
-"""Report a calibration: lines for a person, figures for programs, a picture, files.
+"""Report a calibration: lines, figures, one picture, and the files it writes.
 
 Every calibration ends by `finish`. A `Table` is made once, and read by a person as lines, by programs as JSON.
 """
@@ -23,7 +23,7 @@ class Column:
 
     Attributes:
         title: Its heading; empty: not printed.
-        values: (N,) numbers, NaN where unknown, or texts.
+        values: (N,) numbers, NaN where unknown, or texts; what is only in JSON may be anything.
         form: How a number is printed, such as "8.2f"; empty: texts.
         unit: Printed behind a number.
         key: Its key in JSON, with the unit; what follows a dot is a key of an object in there. Empty: not in JSON.
@@ -31,7 +31,7 @@ class Column:
     """
 
     title: str
-    values: Float | Int | Sequence[str]
+    values: Float | Int | Sequence[object]
     form: str = ""
     unit: str = ""
     key: str = ""
@@ -43,9 +43,9 @@ class Column:
         width, side = max(map(len, texts)), ">" if self.form else "<"
         return [f"{text:{side}{width}s}" for text in texts]
 
-    def _text(self, value: float | str) -> str:
-        if isinstance(value, str):
-            return value
+    def _text(self, value: object) -> str:
+        if not isinstance(value, int | float | np.number):
+            return str(value)
         return "-" if np.isnan(value) else f"{value:{self.form}} {self.unit}".rstrip()
 
 
@@ -99,7 +99,7 @@ def finish(
     lines: Iterable[str],
     numbers: dict[str, object],
     draw: Callable[[Path], None] | None,
-    write: Write,
+    write: Write | None = None,
 ) -> None:
     """End a calibration: print it, draw its picture, write its files and its figures.
 
@@ -108,7 +108,7 @@ def finish(
         lines: The report for a person.
         numbers: The same for programs; "written" is added, the paths of the files.
         draw: Draws the picture; None: there is none.
-        write: Called with `out`.
+        write: Called with `out`; None: the command writes no files.
 
     Raises:
         CalibrationError, RecordingError: A file cannot be written.
@@ -117,10 +117,12 @@ def finish(
     if draw is not None and options.picture is not None:
         draw(options.picture)
         echo(f"drew {options.picture}")
-    written = {} if options.out is None else write(options.out)
-    for path, what in written.items():
-        echo(f"wrote {path}: {what}")
-    if options.out is None:
-        echo("nothing written: give --out DIR")
+    if write is not None:
+        written = {} if options.out is None else write(options.out)
+        for path, what in written.items():
+            echo(f"wrote {path}: {what}")
+        if options.out is None:
+            echo("nothing written: give --out DIR")
+        numbers = numbers | {"written": [str(path) for path in written]}
     if options.json_file is not None:
-        write_summary(options.json_file, numbers | {"written": [str(path) for path in written]})
+        write_summary(options.json_file, numbers)

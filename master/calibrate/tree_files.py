@@ -109,9 +109,10 @@ def _write(path: Path, value: RigCalibration | CameraCalibration | HandProfile |
 def write_into_rig(
     out: Path, file_name: str, rig: RigCalibration, how: Mapping[str, Provenance], **values: object
 ) -> dict[Path, str]:
-    """Write `values` of some keys into rigs/<file_name>.json of the tree `out`, and how they were measured.
+    """Write `values` of keys, and how they were measured, into a rig file.
 
-    The file there is kept but for these keys; where there is none, a new one is like `rig`.
+    That is rigs/<file_name>.json of the tree `out`. The file there is kept but for these keys; where there is
+    none, a new one is like `rig`.
 
     Returns:
         Its path, and the keys.

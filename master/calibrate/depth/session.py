@@ -5,41 +5,30 @@ paired, each camera's centroids are averaged on their own. The session opens the
 """
 
 import os
-import sys
 from argparse import Namespace
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from common.arrays import Float, Int
+from common.arrays import Float
 from common.bus.keys import link_key
-from common.clock import Clock, SystemClock
+from common.clock import SystemClock
 from common.command_line import echo
 from common.errors import CalibrationError, FitError
 from common.messages import Detections, MarkerDetections
 from master.calibrate.depth.source import Measured, load_pair, straightened
-from master.calibrate.depth.sweep import FARTHEST_M, Sweep, parse_distances, write_table
+from master.calibrate.depth.sweep import FARTHEST_M, Sweep, parse_distances, place_of, write_table
+from master.calibrate.session import Session
 from master.commands.options import address
-from master.outputs.bus import Receive
 from master.run.app import AuxiliaryMessage
 from master.run.ingest import Ingest
 
 _QUARTERS = 4
 _PUBLISHED = "1.00:0.20:-0.05"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Reading:
-    """The target at rest."""
-
-    uv: Float  # (2, 2) mean centroids [px] in the two cameras
-    area_px2: Float  # (2,) mean areas
-    sigma_px: float  # standard deviation of one frame pair's disparity [px]
-    frames: Int  # (2,) frames averaged
-    rate_hz: Float  # (2,) rate of the cameras, by their stamps
 
 
 class Meter:
@@ -50,16 +39,16 @@ class Meter:
 
     def __init__(self, cameras: tuple[str, str], marker: int, frames: int, seconds: float) -> None:
         """Wait for `frames` frames of each camera at rest over `seconds`."""
-        self._cameras, self._marker = cameras, marker
+        self.cameras, self._marker = cameras, marker
         self._frames, self._span_ns = max(frames, 2 * _QUARTERS), round(seconds * 1e9)
         self._kept: tuple[deque[tuple[int, Float]], ...] = (deque(), deque())
         self.trouble = f"no frames from {' and '.join(cameras)}"
 
-    def push(self, message: MarkerDetections) -> Reading | None:
-        """Take one camera's detections; return the reading once it is complete."""
-        if message.camera not in self._cameras:
+    def push(self, message: MarkerDetections) -> Sweep | None:
+        """Take one camera's detections; return the place once it is complete."""
+        if message.camera not in self.cameras:
             return None
-        mine = self._kept[self._cameras.index(message.camera)]
+        mine = self._kept[self.cameras.index(message.camera)]
         m = self._marker
         if np.isnan(message.uv[m, 0]):
             mine.clear()
@@ -77,8 +66,13 @@ class Meter:
             for kept in self._kept
         )
 
-    def _judge(self) -> Reading | None:
-        for camera, kept in zip(self._cameras, self._kept, strict=True):
+    @property
+    def rates_hz(self) -> list[float]:
+        """Rates of the two cameras, by their stamps."""
+        return [(len(kept) - 1) / ((kept[-1][0] - kept[0][0]) * 1e-9) for kept in self._kept]
+
+    def _judge(self) -> Sweep | None:
+        for camera, kept in zip(self.cameras, self._kept, strict=True):
             if len(kept) < self._frames or kept[-1][0] - kept[0][0] < self._span_ns:
                 self.trouble = (
                     f"camera {camera!r} does not see the target all the time: it is outside the image, hidden, or the"
@@ -97,14 +91,9 @@ class Meter:
                 f" {shake_px} are allowed"
             )
             return None
-        times = [np.array([t for t, _ in kept], np.int64) for kept in self._kept]
-        return Reading(
-            uv=np.stack([values[:, :2].mean(axis=0) for values in seen]),
-            area_px2=np.array([values[:, 2].mean() for values in seen]),
-            sigma_px=float(np.hypot(*(values[:, 0].std(ddof=1) for values in seen))),
-            frames=np.array([len(values) for values in seen]),
-            rate_hz=np.array([(t.size - 1) / ((t[-1] - t[0]) * 1e-9) for t in times]),
-        )
+        sigma_px = float(np.hypot(*(values[:, 0].std(ddof=1) for values in seen)))
+        uv, area = [values[:, :2] for values in seen], [values[:, 2] for values in seen]
+        return place_of(uv, area, sigma_px, "reading", float("nan"))
 
 
 def _drift(uv: Float) -> float:
@@ -113,80 +102,72 @@ def _drift(uv: Float) -> float:
     return float(np.ptp(means, axis=0).max())
 
 
-def measure(
-    receive: Receive[Detections | AuxiliaryMessage],
-    meter: Meter,
-    clock: Clock,
-    progress: Callable[[float], None],
-) -> Reading:
-    """Read the target that stands before the cameras now.
+Live = Session[Detections | AuxiliaryMessage]
+
+
+def read(session: Live, meter: Meter) -> Sweep:
+    """Read the target that stands before the cameras now; its distance is NaN.
 
     Raises:
         FitError: It did not stand still, or was not seen, for ten seconds; the message states which.
     """
-    while receive(0.0) is not None:  # what was seen while it was being put there
+    while session.receive(0.0) is not None:  # what was seen while it was being put there
         pass
-    since_ns = clock.now_ns()
-    while clock.now_ns() - since_ns < 10.0 * 1e9:
-        message = receive(0.1)
+    since_ns = session.clock.now_ns()
+    for message in session.during(10.0):
         if not isinstance(message, MarkerDetections) or message.t_ns < since_ns:
             continue
         reading = meter.push(message)
-        progress(meter.progress)
+        session.person.progress(meter.progress)
         if reading is not None:
             return reading
     raise FitError(meter.trouble)
 
 
-def run_session(
-    receive: Receive[Detections | AuxiliaryMessage],
-    cameras: tuple[str, str],
-    marker: int,
-    distances: Sequence[float],
-    *,
-    frames: int,
-    seconds: float,
-    clock: Clock,
-    ask: Callable[[str], str | None],
-    notify: Callable[[str], None],
-    progress: Callable[[float], None],
-    keep: Callable[[Sweep], None],
+def guide(
+    session: Live, new_meter: Callable[[], Meter], distances: Sequence[float], keep: Callable[[Sweep], None]
 ) -> Sweep:
     """Lead a person through a sweep; return all places in the order of measurement.
 
     Args:
-        receive: Gives detections, times on `clock`, the master's.
-        cameras: First (left) and second camera.
-        marker: Index of the target's marker.
-        frames, seconds: Frames of each camera to average, and time over which, at least.
-        ask: Shows a prompt and returns the answer; None: nobody answers any more.
-        progress: Called with the share of a reading that is done.
+        session: Its messages have times on its clock, the master's.
+        new_meter: Makes the meter of one place.
         keep: Given the sweep so far after each reading, to save it.
     """
-    done: list[tuple[float, Reading]] = []
-    waiting = deque(distances)
+    done: list[Sweep] = []
+    waiting, person = deque(distances), session.person
     while waiting:
-        answer = ask(f"target at {waiting[0]:.3f} m, then Enter (its true distance; s to skip; q to end): ")
+        answer = person.ask(
+            f"target at {waiting[0]:.3f} m, then Enter (its true distance; s to skip; q to end): "
+        )
         answer = None if answer is None else answer.strip().lower()
         if answer is None or answer == "q":
             break
-        distance = waiting[0] if answer == "" else _number(answer)
-        if answer == "s" or distance is None:
-            if answer == "s":
-                waiting.popleft()
-            else:
-                notify(f"{answer!r}: neither a distance in metres, nor s, nor q")
+        if answer == "s":
+            waiting.popleft()
             continue
+        distance = waiting[0] if answer == "" else _number(answer)
+        if distance is None:
+            person.notify(f"{answer!r}: neither a distance in metres, nor s, nor q")
+            continue
+        meter = new_meter()
         try:
-            reading = measure(receive, Meter(cameras, marker, frames, seconds), clock, progress)
+            reading = read(session, meter)
         except FitError as error:
-            notify(f"{distance:.3f} m: not measured: {error}; try again")
+            person.notify(f"{distance:.3f} m: not measured: {error}; try again")
             continue
         waiting.popleft()
-        done.append((distance, reading))
-        notify(_reading_line(distance, reading, cameras))
-        keep(_sweep(done))
-    return _sweep(done)
+        place = f"reading {len(done) + 1}"
+        done.append(replace(reading, distance_m=np.array([distance]), place=(place,)))
+        rates = zip(meter.cameras, meter.rates_hz, strict=True)
+        person.notify(
+            f"{len(done)} of {len(done) + len(waiting)}, {distance:.3f} m: disparity {reading.disparity_px[0]:.3f} px,"
+            f" standard deviation {reading.sigma_px[0]:.3f} px, {reading.frames[0]} frames (cameras: "
+            + ", ".join(f"{camera} {rate:.1f} Hz" for camera, rate in rates)
+            + ")"
+        )
+        keep(Sweep.joined(done))
+    return Sweep.joined(done)
 
 
 def _number(text: str) -> float | None:
@@ -195,28 +176,6 @@ def _number(text: str) -> float | None:
     except ValueError:
         return None
     return value if 0.0 < value < FARTHEST_M else None
-
-
-def _reading_line(distance: float, reading: Reading, cameras: tuple[str, str]) -> str:
-    disparity = float(reading.uv[0, 0] - reading.uv[1, 0])
-    rates = ", ".join(f"{c} {r:.1f} Hz" for c, r in zip(cameras, reading.rate_hz.tolist(), strict=True))
-    return (
-        f"{distance:.3f} m: disparity {disparity:.3f} px, standard deviation {reading.sigma_px:.3f} px,"
-        f" {int(reading.frames.min())} frames (cameras: {rates})"
-    )
-
-
-def _sweep(done: Sequence[tuple[float, Reading]]) -> Sweep:
-    uv = np.stack([r.uv for _, r in done], axis=1) if done else np.empty((2, 0, 2))
-    return Sweep(
-        distance_m=np.array([d for d, _ in done], np.float64),
-        disparity_px=uv[0, :, 0] - uv[1, :, 0],
-        uv=uv,
-        area_px2=np.stack([r.area_px2 for _, r in done], axis=1) if done else np.empty((2, 0)),
-        sigma_px=np.array([r.sigma_px for _, r in done], np.float64),
-        frames=np.array([int(r.frames.min()) for _, r in done], np.int64),
-        place=tuple(f"reading {i}" for i in range(1, len(done) + 1)),
-    )
 
 
 def sweep_live(options: Namespace, outline: Float) -> Measured:
@@ -241,39 +200,11 @@ def sweep_live(options: Namespace, outline: Float) -> Measured:
     try:
         host, port = ingest.address
         echo(f"listening on {host}:{port}; {len(wanted)} distances, marker {marker!r}")
-        sweep = run_session(
-            ingest.get,
-            pair.cameras,
-            names.index(marker),
-            wanted,
-            frames=options.frames,
-            seconds=options.seconds,
-            clock=clock,
-            ask=_ask,
-            notify=_print,
-            progress=_progress,
-            keep=keep,
-        )
+        meter = partial(Meter, pair.cameras, names.index(marker), options.frames, options.seconds)
+        sweep = guide(Session(ingest.get, clock=clock), meter, wanted, keep)
     finally:
         ingest.close()
     sweep, note = straightened(sweep, pair, outline)
     rates = ", ".join(f"{file.name} {file.frame_rate_hz:g} Hz" for file in pair.files)
     about = f"{sweep.size} places of the marker {marker!r}, measured live (cameras set to {rates}){note}"
-    return Measured(sweep, pair, (table.name if table is not None else "live",), about)
-
-
-def _ask(prompt: str) -> str | None:
-    echo(prompt, end="")
-    line = sys.stdin.readline()
-    return line.rstrip("\n") if line else None
-
-
-def _print(line: str) -> None:
-    if sys.stderr.isatty():
-        echo("\r\033[K", end="", error=True)  # the progress goes
-    echo(line)
-
-
-def _progress(share: float) -> None:
-    if sys.stderr.isatty():
-        echo(f"\rreading {100 * share:3.0f} % ", end="", error=True)
+    return Measured(sweep, pair, table.name if table is not None else "live", about)

@@ -5,8 +5,8 @@ interpolation nor the rolling shutter matters; `still_runs` excludes the frames 
 place.
 """
 
+from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,8 +20,8 @@ from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections
 from common.recording.frame_recording import FrameRecording, open_recording
 from common.recording.recorded_files import TRUTH, has_truth, read_truth
-from master.calibrate.depth.sweep import Sweep, column, parse_distances, read_table, rows_of
-from master.calibrate.tree_files import load_marker_rig, refusals_named
+from master.calibrate.depth.sweep import Sweep, column, parse_distances, place_of, read_table, rows_of
+from master.calibrate.tree_files import load_marker_rig
 from master.fabrik.caps import card_outline, centre_of_blob, round_outline
 from master.replay.recorded import recorded_detections
 
@@ -196,16 +196,17 @@ def _averaged(pairs: Pairs, runs: Sequence[Int], distance: Float) -> Sweep:
     """One place for each run of pairs."""
     disparity = pairs.uv[0, :, 0] - pairs.uv[1, :, 0]
     stated = np.hypot(pairs.sigma_px[0], pairs.sigma_px[1])
-    return Sweep(
-        distance_m=np.asarray(distance, np.float64),
-        disparity_px=np.array([disparity[run].mean() for run in runs]),
-        uv=np.stack([pairs.uv[:, run].mean(axis=1) for run in runs], axis=1),
-        area_px2=np.stack([pairs.area_px2[:, run].mean(axis=1) for run in runs], axis=1),
-        sigma_px=np.array(
-            [disparity[run].std(ddof=1) if run.size >= STILL_FRAMES else stated[run].mean() for run in runs]
-        ),
-        frames=np.array([run.size for run in runs], np.int64),
-        place=tuple(f"frame {run[0]}" if run.size == 1 else f"frames {run[0]}-{run[-1]}" for run in runs),
+    return Sweep.joined(
+        [
+            place_of(
+                pairs.uv[:, run],
+                pairs.area_px2[:, run],
+                float(disparity[run].std(ddof=1) if run.size >= STILL_FRAMES else stated[run].mean()),
+                f"frame {run[0]}" if run.size == 1 else f"frames {run[0]}-{run[-1]}",
+                d,
+            )
+            for run, d in zip(runs, distance.tolist(), strict=True)
+        ]
     )
 
 
@@ -261,12 +262,8 @@ class Measured:
 
     sweep: Sweep  # unchecked, as measured but for the lens' shift of the centroids
     pair: Pair
-    data: tuple[str, ...]  # names of what it was read from, for the provenance
+    data: str  # name of what it was read from, for the provenance
     about: str  # one line that describes it
-
-    def named(self) -> AbstractContextManager[None]:
-        """Refusals of the sweep begin with what it was read from."""
-        return refusals_named(", ".join(self.data))
 
 
 def pair_of(
@@ -278,18 +275,20 @@ def pair_of(
     """The first two cameras of a rig; without models where one has no intrinsics.
 
     Raises:
-        CalibrationError: The rig has fewer than two cameras, or is none of markers.
+        CalibrationError: The rig has fewer than two cameras, is none of markers, or a file of them is missing.
     """
     if rig.kind != "markers" or len(rig.cameras) < 2:
         raise CalibrationError(f"rig {rig.name!r}: a depth needs a rig of kind 'markers' with two cameras")
     first, second = rig.cameras[:2]
-    two = (files[first], files[second])
-    models = None
-    if all(file.intrinsics is not None for file in two):
-        models = (
-            CameraModel.of(two[0], rig.camera_pose(first)),
-            CameraModel.of(two[1], rig.camera_pose(second)),
+    if missing := [name for name in (first, second) if name not in files]:
+        raise CalibrationError(
+            f"rig {rig.name!r} has the camera {missing[0]!r}, {origin} has not; it has {', '.join(files)}: record both"
+            " cameras of the rig, or name the rig that was recorded with --rig"
         )
+    two, models = (files[first], files[second]), None
+    if all(file.intrinsics is not None for file in two):
+        left, right = (CameraModel.of(file, rig.camera_pose(file.name)) for file in two)
+        models = left, right
     return Pair(rig, file_name or rig.name, (first, second), two, models, origin)
 
 
@@ -317,8 +316,6 @@ def load_pair(
     origin = str(calibration)
     # Files made for their colours may carry the lens of another recording: only measured ones are the better ones.
     if recorded is not None and not (files and all("intrinsics" in f.provenance for f in files.values())):
-        if missing := [name for name in rig.cameras if name not in recorded]:
-            raise CalibrationError(f"rig {rig_name!r} has the camera {missing[0]!r}, the recording has not")
         files, origin = dict(recorded), "the recording"
     return pair_of(rig, {name: _with_view(file, fov_deg) for name, file in files.items()}, rig_name, origin)
 
@@ -326,7 +323,7 @@ def load_pair(
 def from_table(path: Path, pair: Pair, outline: Float) -> Measured:
     """The sweep of a CSV."""
     sweep, note = straightened(read_table(path), pair, outline)
-    return Measured(sweep, pair, (path.name,), f"{sweep.size} rows of {path}{note}")
+    return Measured(sweep, pair, path.name, f"{sweep.size} rows of {path}{note}")
 
 
 def from_recording(
@@ -365,7 +362,7 @@ def from_recording(
     sweep, note = straightened(sweep, pair, outline)
     frames = f"{pairs.t_ns.size} frame pairs of {folder.name}"
     about = f"{sweep.size} places of the marker {target!r} in {frames}, {summary}{note}"
-    return Measured(sweep, pair, (folder.name,), about)
+    return Measured(sweep, pair, folder.name, about)
 
 
 def parse_target(text: str) -> Float:
@@ -389,12 +386,12 @@ def straightened(sweep: Sweep, pair: Pair, outline: Float) -> tuple[Sweep, str]:
     """The sweep with projections of the target's centre, and a note to print."""
     if pair.models is None or np.isnan(sweep.area_px2).all():
         return sweep, ""
-    seen = zip(pair.models, sweep.uv, sweep.area_px2, strict=True)
-    uv = np.stack([centre_of_blob(model, uv, area, outline) for model, uv, area in seen])
+    seen = zip(pair.models, np.moveaxis(sweep.uv, 1, 0), sweep.area_px2.T, strict=True)
+    uv = np.stack([centre_of_blob(model, uv, area, outline) for model, uv, area in seen], axis=1)
     shift = float(np.nanmax(np.abs(uv - sweep.uv), initial=0.0))
     noted_px = 0.02  # shift of a centroid worth a line
     note = f"; the lens shifts its centroid by up to {shift:.2f} px, corrected" if shift > noted_px else ""
-    return replace(sweep, uv=uv, disparity_px=uv[0, :, 0] - uv[1, :, 0]), note
+    return replace(sweep, uv=uv, disparity_px=uv[:, 0, 0] - uv[:, 1, 0]), note
 
 
 def _placed(recording: FrameRecording, pairs: Pairs, distances: str | None) -> tuple[Sweep, str]:
@@ -410,6 +407,47 @@ def _placed(recording: FrameRecording, pairs: Pairs, distances: str | None) -> t
     if distances.endswith(".csv"):
         return by_file(pairs, Path(distances)), f"distances from {distances}"
     return by_list(pairs, parse_distances(distances)), f"distances {distances}"
+
+
+def measured_from(options: Namespace, outline: Float) -> Measured:
+    """The sweep of a recording or a table.
+
+    Raises:
+        PhalanxError: What the user gave does not make one; the message states what is missing.
+    """
+    source: Path | None = options.source
+    rig: str | None = options.rig
+    if source is None:
+        raise CalibrationError("what to read is missing: give the folder of a recording, a .csv, or --live")
+    if source.is_dir():
+
+        def pair_for(recording: FrameRecording) -> Pair:
+            manifest = recording.manifest
+            if rig is None:
+                return pair_of(manifest.marker_rig(), manifest.cameras)
+            return load_pair(options.calibration, rig, options.fov_deg, manifest.cameras)
+
+        return from_recording(
+            source, options.detections, options.marker, options.distances, pair_for, outline
+        )
+    if source.suffix.lower() != ".csv":
+        there = source.exists()
+        raise CalibrationError(
+            f"{source}: {'neither' if there else 'does not exist; give'} the folder of a recording"
+            f" {'nor' if there else 'or'} a .csv"
+        )
+    idle = {name: vars(options)[name] for name in ("detections", "marker", "distances")}
+    refuse_idle(f"{source}, a table", **idle)
+    pair = Pair() if rig is None else load_pair(options.calibration, rig, options.fov_deg)
+    return from_table(source, pair, outline)
+
+
+def refuse_idle(where: str, **given: object) -> None:
+    """Reject options that `where` does not use, rather than ignore them."""
+    for name, value in given.items():
+        if value:
+            option = "a recording or a table" if name == "source" else f"--{name}"
+            raise CalibrationError(f"{option} has no meaning with {where}: leave it out")
 
 
 def _with_view(file: CameraCalibration, fov_deg: float | None) -> CameraCalibration:

@@ -7,7 +7,7 @@ Both cameras of a pair see the target. Refused is what would give a law that loo
 import csv
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,24 +22,45 @@ FARTHEST_M = 10.0  # beyond it, 75 mm of baseline give less than 4 px: these are
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sweep:
-    """N places of the target."""
+    """N places of the target: the first axis of every field; cameras: left, right."""
 
     distance_m: Float  # (N,) of the target's centre along the first camera's axis [m]
     disparity_px: Float  # (N,) u of the first camera minus u of the second [px]
-    uv: Float  # (2, N, 2) centroids [px], distorted images; NaN: only the disparity is known, or not seen
-    area_px2: Float  # (2, N) [px^2]; NaN: not known
+    # (N, 2, 2) centroids in both cameras [px], distorted images; NaN: only the disparity is known, or not seen
+    uv: Float
+    area_px2: Float  # (N, 2) [px^2]; NaN: not known
     sigma_px: Float  # (N,) standard deviation of one frame pair's disparity [px]; NaN: not known
     frames: Int  # (N,) frame pairs that were averaged
     place: tuple[str, ...]  # (N,) where each point comes from, for messages: "line 5", "frame 12"
 
     @classmethod
+    def of(
+        cls,
+        distance_m: Float,
+        uv: Float,
+        area_px2: Float,
+        place: Sequence[str],
+        sigma_px: Float | None = None,
+        frames: Int | None = None,
+    ) -> "Sweep":
+        """A sweep by centroids, each of one frame pair where nothing else is given."""
+        n = len(place)
+        sigma, one = np.full(n, np.nan), np.ones(n, np.int64)
+        return cls(
+            distance_m,
+            uv[:, 0, 0] - uv[:, 1, 0],
+            uv,
+            area_px2,
+            sigma if sigma_px is None else sigma_px,
+            one if frames is None else frames,
+            tuple(place),
+        )
+
+    @classmethod
     def of_disparity(cls, distance_m: Float, disparity_px: Float, place: Sequence[str]) -> "Sweep":
         """A sweep of which nothing but distances and disparities is known."""
-        n = distance_m.size
-        nan = np.full((2, n, 2), np.nan)
-        return cls(
-            distance_m, disparity_px, nan, nan[..., 0], nan[0, :, 0], np.ones(n, np.int64), tuple(place)
-        )
+        nan = np.full((len(place), 2, 2), np.nan)
+        return replace(cls.of(distance_m, nan, nan[..., 0], place), disparity_px=disparity_px)
 
     @property
     def size(self) -> int:
@@ -50,20 +71,48 @@ class Sweep:
         """The chosen places, by mask (N,) or by index (K,)."""
         index: Int = np.arange(self.size)[chosen]
         order: list[int] = index.tolist()
-        return Sweep(
-            self.distance_m[index],
-            self.disparity_px[index],
-            self.uv[:, index],
-            self.area_px2[:, index],
-            self.sigma_px[index],
-            self.frames[index],
-            tuple(self.place[i] for i in order),
-        )
+        return Sweep(*(array[index] for array in self._arrays()), tuple(self.place[i] for i in order))
+
+    def mean(self) -> "Sweep":
+        """One place: the mean of all, which stand at the same distance."""
+        distance, disparity, uv, area, sigma, frames = self._arrays()
+        means = (array.mean(axis=0, keepdims=True) for array in (distance, disparity, uv, area, sigma))
+        return Sweep(*means, frames.sum(keepdims=True), ("mean of " + ", ".join(self.place),))
+
+    @staticmethod
+    def joined(parts: Sequence["Sweep"]) -> "Sweep":
+        """All places of several sweeps, in their order."""
+        if not parts:
+            return Sweep.of_disparity(np.empty(0), np.empty(0), ())
+        arrays = (np.concatenate(same) for same in zip(*(part._arrays() for part in parts), strict=True))
+        return Sweep(*arrays, tuple(name for part in parts for name in part.place))
+
+    def _arrays(self) -> tuple[Float, Float, Float, Float, Float, Int]:
+        return self.distance_m, self.disparity_px, self.uv, self.area_px2, self.sigma_px, self.frames
 
     def names(self, chosen: Bool | Int) -> str:
         """The chosen places in words: "0.45 m (line 12), 0.5 m (line 13)"."""
         index: list[int] = np.arange(self.size)[chosen].tolist()
         return ", ".join(f"{self.distance_m[i]:.4g} m ({self.place[i]})" for i in index)
+
+
+def place_of(
+    uv: Sequence[Float], area_px2: Sequence[Float], sigma_px: float, place: str, distance_m: float
+) -> Sweep:
+    """The place of a target at rest, by the mean of each camera's frames.
+
+    Args:
+        uv, area_px2: Centroids (T, 2) [px] and areas (T,) [px^2] of each camera's own T frames.
+        sigma_px: Standard deviation of one frame pair's disparity [px].
+    """
+    return Sweep.of(
+        np.array([distance_m], np.float64),
+        np.array([[one.mean(axis=0) for one in uv]]),
+        np.array([[one.mean() for one in area_px2]]),
+        (place,),
+        np.array([sigma_px]),
+        np.array([min(map(len, uv))], np.int64),
+    )
 
 
 def checked(sweep: Sweep, cameras: tuple[str, str], size_px: tuple[int, int] | None = None) -> Sweep:
@@ -138,8 +187,8 @@ def _check_seen(sweep: Sweep, cameras: tuple[str, str]) -> None:
     if not lost.any():
         return
     for index, camera in enumerate(cameras):
-        unseen = np.isnan(sweep.uv[index, :, 0]) & lost
-        other = np.isfinite(sweep.uv[1 - index, :, 0])
+        unseen = np.isnan(sweep.uv[:, index, 0]) & lost
+        other = np.isfinite(sweep.uv[:, 1 - index, 0])
         if (unseen & other).any():
             raise FitError(
                 f"camera {camera!r} does not see the target at {sweep.names(unseen & other)}: it is outside that image,"
@@ -164,19 +213,19 @@ def _check_signs(sweep: Sweep, cameras: tuple[str, str]) -> None:
 
 def _check_whole(sweep: Sweep, cameras: tuple[str, str], size_px: tuple[int, int]) -> None:
     """Refuse targets cut by the image's border: their centroid lies inward."""
-    nominal = sweep.area_px2 * sweep.distance_m**2
+    nominal = sweep.area_px2 * sweep.distance_m[:, None] ** 2
     if sweep.size == 0 or not np.isfinite(nominal).all():
         return
-    typical = np.median(nominal, axis=1, keepdims=True)
+    typical = np.median(nominal, axis=0)
     gap = np.minimum(sweep.uv, np.array(size_px) - 1.0 - sweep.uv).min(axis=2)
     # area x distance^2 of a target that faces the cameras is constant; a tilt by 30 deg costs 13 %
     whole = 0.85
     half_length = 0.62  # of the published target (75 x 50 mm), in square roots of its area
-    cut = (nominal < whole * typical) & (gap < half_length * np.sqrt(typical) / sweep.distance_m)
+    cut = (nominal < whole * typical) & (gap < half_length * np.sqrt(typical) / sweep.distance_m[:, None])
     for index, camera in enumerate(cameras):
-        if cut[index].any():
+        if cut[:, index].any():
             raise FitError(
-                f"the target is partly outside the image of camera {camera!r} at {sweep.names(cut[index])}: its area"
+                f"the target is partly outside the image of camera {camera!r} at {sweep.names(cut[:, index])}: its area"
                 " there is too small for the distance; put it where both cameras see all of it, or take a smaller one"
             )
 
@@ -200,32 +249,8 @@ def _merged(sweep: Sweep) -> Sweep:
                 f"the same distance {d:.4g} m was measured with disparities that disagree ({listed}): more than"
                 f" {1e3 * ruler_m:.0f} mm on the ruler explain; measure it again or leave one out"
             )
-        parts.append(same if same.size == 1 else _mean(same))
-    return _joined(parts) if parts else sweep
-
-
-def _mean(same: Sweep) -> Sweep:
-    return Sweep(
-        same.distance_m.mean(keepdims=True),
-        same.disparity_px.mean(keepdims=True),
-        same.uv.mean(axis=1, keepdims=True),
-        same.area_px2.mean(axis=1, keepdims=True),
-        same.sigma_px.mean(keepdims=True),
-        same.frames.sum(keepdims=True),
-        ("mean of " + ", ".join(same.place),),
-    )
-
-
-def _joined(parts: Sequence[Sweep]) -> Sweep:
-    return Sweep(
-        np.concatenate([part.distance_m for part in parts]),
-        np.concatenate([part.disparity_px for part in parts]),
-        np.concatenate([part.uv for part in parts], axis=1),
-        np.concatenate([part.area_px2 for part in parts], axis=1),
-        np.concatenate([part.sigma_px for part in parts]),
-        np.concatenate([part.frames for part in parts]),
-        tuple(name for part in parts for name in part.place),
-    )
+        parts.append(same if same.size == 1 else same.mean())
+    return Sweep.joined(parts)
 
 
 def _check_falls(sweep: Sweep) -> None:
@@ -280,12 +305,10 @@ def read_table(path: Path) -> Sweep:
     def of(kind: str) -> Float:
         names = [kind.format(side) for side in ("left", "right")]
         nan = np.full(len(rows), np.nan)
-        return np.stack([column(path, rows, name) if name in columns else nan for name in names])
+        return np.stack([column(path, rows, name) if name in columns else nan for name in names], axis=-1)
 
     uv = np.stack([of("u_{}_px"), of("v_{}_px")], axis=-1)
-    nan = np.full(len(rows), np.nan)
-    disparity = uv[0, :, 0] - uv[1, :, 0]
-    return Sweep(distance, disparity, uv, of("area_{}_px2"), nan, np.ones(len(rows), np.int64), tuple(place))
+    return Sweep.of(distance, uv, of("area_{}_px2"), place)
 
 
 def write_table(path: Path, sweep: Sweep) -> None:
@@ -296,8 +319,8 @@ def write_table(path: Path, sweep: Sweep) -> None:
     """
     lines = ["distance_m,u_left_px,v_left_px,u_right_px,v_right_px,area_left_px2,area_right_px2"]
     for i in range(sweep.size):
-        (ul, vl), (ur, vr) = sweep.uv[:, i]
-        al, ar = sweep.area_px2[:, i]
+        (ul, vl), (ur, vr) = sweep.uv[i]
+        al, ar = sweep.area_px2[i]
         lines.append(f"{sweep.distance_m[i]:.5f},{ul:.4f},{vl:.4f},{ur:.4f},{vr:.4f},{al:.1f},{ar:.1f}")
     try:
         with replacing(path) as file:

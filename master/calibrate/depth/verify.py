@@ -1,29 +1,45 @@
-"""A verification compares the measured depth error with the error budget.
+"""`phalanx calibrate verify`: measured depth errors against the error budget.
 
-It gives the published table of 20...100 cm for every depth model that the rig has, as lines, numbers and a
-plot. Three things stand side by side and must not be mixed: what a sweep *measured*, at the angles at which
-the target stood; what *noise and time* cost by the derivatives of the ideal law
-(`master.fabrik.depth.error_budget`); and what a law of raw disparity costs *off the axis*, where it was not
-fitted, by projecting points with the rig's own cameras. The last is exact for the model, and as true as the
-rig's stereo calibration is.
+It gives the published table of 20...100 cm for every depth model that the rig has, as lines, numbers and a plot. Three
+things stand side by side and must not be mixed: what a sweep *measured*, at the angles at which the target stood; what
+*noise and time* cost by the derivatives of the ideal law (`master.fabrik.depth.error_budget`); and what a law of raw
+disparity costs *off the axis*, where it was not fitted, by projecting points with the rig's own cameras. The last is
+exact for the model, and as true as the rig's stereo calibration is.
 """
 
+from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 
-from common.arrays import Bool, Float
-from common.calibration import RigCalibration
-from common.calibration.files import replacing
-from common.errors import RecordingError
+from common.arrays import Float
+from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import invert, transform
-from master.calibrate.depth.fit import ideal_of
-from master.calibrate.depth.sweep import Sweep
+from master.calibrate.depth.fit import (
+    draw_errors,
+    ideal_of,
+    laws_of,
+)
+from master.calibrate.depth.source import (
+    Measured,
+    Pair,
+    load_pair,
+    measured_from,
+    parse_target,
+)
+from master.calibrate.depth.sweep import Sweep, check_places, parse_distances, parse_numbers
+from master.calibrate.report import Column, Table, finish, plain
+from master.calibrate.tree_files import refusals_named
 from master.estimator.sensors import CameraArrays
-from master.fabrik.depth import AffineDisparity, DepthLaw, ErrorBudget, PowerLaw, error_budget
+from master.fabrik.depth import (
+    DepthLaw,
+    ErrorBudget,
+    error_budget,
+    tolerable_skew_s,
+)
 from master.fabrik.intersection import triangulate
 
 Cameras = tuple[CameraModel, CameraModel]
@@ -67,16 +83,6 @@ class Verified:
         }
 
 
-def laws_of(rig: RigCalibration) -> dict[str, DepthLaw]:
-    """The laws of raw disparity that the rig file holds, by the name of their key."""
-    laws: dict[str, DepthLaw] = {}
-    if rig.power_law is not None:
-        laws["power_law"] = PowerLaw.of(rig.power_law)
-    if rig.affine_disparity is not None:
-        laws["affine_disparity"] = AffineDisparity.of(rig.affine_disparity)
-    return laws
-
-
 def verify(sweep: Sweep, laws: Mapping[str, DepthLaw], cameras: Cameras | None, noise: Noise) -> Verified:
     """Errors of every depth model at every place of a sweep, nearest first.
 
@@ -90,7 +96,7 @@ def verify(sweep: Sweep, laws: Mapping[str, DepthLaw], cameras: Cameras | None, 
     if cameras is not None:
         law = ideal_of(*cameras)
         if np.isfinite(sweep.uv).all():
-            points = stereo_points(cameras, sweep.uv)
+            points = stereo_points(cameras, np.moveaxis(sweep.uv, 1, 0))
             errors["stereo"] = points[:, 2] - d
             off = points - middle(cameras)
             angle = np.degrees(np.arctan2(np.hypot(off[:, 0], off[:, 1]), off[:, 2]))
@@ -146,78 +152,69 @@ def budget(cameras: Cameras, distance_m: Float, noise: Noise) -> list[ErrorBudge
     ]
 
 
-def measured_lines(found: Verified) -> list[str]:
+def measured_table(found: Verified) -> Table:
     """Errors by distance and model, and their means; beside them what noise explains."""
-    names = list(found.error_m)
-    lines = [
-        "measured  distance  off axis  " + "  ".join(f"{name:>20s}" for name in names) + "   noise, 1 sigma"
-    ]
-    for i in range(found.sweep.size):
-        cells = "  ".join(
-            f"{_mm(found.error_m[name][i])} {_percent(found.relative(name)[i])}" for name in names
-        )
-        angle = found.off_axis_deg[i]
-        lines.append(
-            f"          {found.sweep.distance_m[i]:6.3f} m  {'   -   ' if np.isnan(angle) else f'{angle:5.1f}°'}  "
-            f"  {cells}   {1e3 * found.expected_m[i]:6.2f} mm"
-        )
-    for which in ("mean", "max"):
-        cells = "  ".join(
-            f"{found.figures(n)[f'{which}_mm']:8.2f} mm {found.figures(n)[f'{which}_percent']:6.2f} %"
-            for n in names
-        )
-        lines.append(f"          {which + ' |error|':18s}  {cells}")
-    return lines
+    models: list[Column] = []
+    for name, error in found.error_m.items():
+        own = found.figures(name)
+        mm, percent = ([own[f"{which}_{unit}"] for which in ("mean", "max")] for unit in ("mm", "percent"))
+        models += [
+            Column(name, 1e3 * error, "+.2f", "mm", f"error_mm.{name}", mm),
+            Column(" ", 100.0 * found.relative(name), "+.2f", "%", f"error_percent.{name}", percent),
+        ]
+    return Table(
+        (
+            Column("measured at", found.sweep.distance_m, ".3f", "m", "distance_m"),
+            Column("off axis", found.off_axis_deg, ".1f", "°", "off_axis_deg"),
+            *models,
+            Column("noise, 1 sigma", 1e3 * found.expected_m, ".2f", "mm", "expected_sigma_mm"),
+            Column("", found.sweep.frames, key="frames"),
+        ),
+        ("mean |error|", "max |error|"),
+    )
 
 
-def budget_lines(distance_m: Float, expected: Sequence[ErrorBudget], noise: Noise) -> list[str]:
+def budget_table(distance_m: Float, expected: Sequence[ErrorBudget], noise: Noise) -> Table:
     """What one pixel, the noise and the time cost at each distance."""
+    pixel, centroid, sync = 1e3 * np.array([(e.per_pixel_m, e.centroid_m, e.sync_m) for e in expected]).T
     apart = f"{noise.speed_m_s:g} m/s, {1e3 * noise.skew_s:g} ms apart"
-    lines = [
-        f"budget    distance   one pixel  {f'{noise.sigma_px:g} px noise':>18s}  {apart:>22s}  {'both':>18s}"
-    ]
-    for d, e in zip(distance_m.tolist(), expected, strict=True):
-        both = float(np.hypot(e.centroid_m, e.sync_m))
-        lines.append(
-            f"          {d:6.3f} m {1e3 * e.per_pixel_m:8.2f} mm  {_cost(e.centroid_m, d)}      {_cost(e.sync_m, d)}"
-            f"  {_cost(both, d)}"
+
+    def cost(title: str, mm: Float, key: str) -> tuple[Column, Column]:
+        return Column(title, mm, ".2f", "mm", key), Column(" ", 0.1 * mm / distance_m, ".2f", "%")
+
+    return Table(
+        (
+            Column("budget at", distance_m, ".3f", "m", "distance_m"),
+            Column("one pixel", pixel, ".2f", "mm", "one_pixel_mm"),
+            *cost(f"{noise.sigma_px:g} px noise", centroid, "noise_mm"),
+            *cost(apart, sync, "sync_mm"),
+            *cost("both", np.hypot(centroid, sync), "both_mm"),
         )
-    return lines
+    )
 
 
 def off_axis_lines(distance_m: Float, angle_deg: Float, errors: Mapping[str, Float]) -> list[str]:
     """What each law costs to the side, by angle and distance."""
     lines: list[str] = []
     for name, error in errors.items():
+        cells = (
+            Column(f"{d:.2f} m", 100.0 * e, "+.2f", "%")
+            for d, e in zip(distance_m.tolist(), error.T, strict=True)
+        )
         lines.append(
             f"off axis, {name}: error of depth with the rig's own cameras; stereo has none by construction"
         )
-        lines.append("          angle   " + "".join(f"{d:8.2f} m" for d in distance_m.tolist()))
-        lines += [
-            f"          {angle:+5.0f}°  " + "".join(f"  {_percent(e)}" for e in row.tolist())
-            for angle, row in zip(angle_deg.tolist(), error, strict=True)
-        ]
+        lines += Table((Column("angle", angle_deg, "+.0f", "°"), *cells)).lines()
     return lines
 
 
 def verified_json(found: Verified) -> dict[str, object]:
     """The measured part as numbers."""
-    rows = [
-        {
-            "distance_m": float(found.sweep.distance_m[i]),
-            "off_axis_deg": _number(found.off_axis_deg[i]),
-            "frames": int(found.sweep.frames[i]),
-            "error_mm": {name: _number(1e3 * error[i]) for name, error in found.error_m.items()},
-            "error_percent": {name: _number(100 * found.relative(name)[i]) for name in found.error_m},
-            "expected_sigma_mm": _number(1e3 * found.expected_m[i]),
-        }
-        for i in range(found.sweep.size)
-    ]
     models = {
-        name: {figure: _number(value) for figure, value in found.figures(name).items()}
+        name: {figure: plain(value) for figure, value in found.figures(name).items()}
         for name in found.error_m
     }
-    return {"models": models, "rows": rows}
+    return {"models": models, "rows": measured_table(found).json()}
 
 
 def expected_json(
@@ -228,102 +225,115 @@ def expected_json(
     errors: Mapping[str, Float],
 ) -> dict[str, object]:
     """Budget and off-axis table as numbers."""
-    rows = [
-        {
-            "distance_m": d,
-            "one_pixel_mm": 1e3 * e.per_pixel_m,
-            "noise_mm": 1e3 * e.centroid_m,
-            "sync_mm": 1e3 * e.sync_m,
-        }
-        for d, e in zip(distance_m.tolist(), expected, strict=True)
-    ]
     assumed = {"sigma_px": noise.sigma_px, "speed_m_s": noise.speed_m_s, "skew_ms": 1e3 * noise.skew_s}
     off = {
         "distance_m": distance_m.tolist(),
         "angle_deg": angle_deg.tolist(),
-        "error_percent": {
-            name: [[_number(100 * e) for e in row] for row in error.tolist()]
-            for name, error in errors.items()
-        },
+        "error_percent": {name: plain(100.0 * error) for name, error in errors.items()},
     }
+    rows = budget_table(distance_m, expected, noise).json()
     return {"budget": {"assumed": assumed, "rows": rows}, "off_axis": off}
 
 
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+_TABLE = "0.20:1.00:0.10"  # where the budget is printed
 
 
-def _mm(metres: float) -> str:
-    return f"{'-':>11s}" if np.isnan(metres) else f"{1e3 * metres:+8.2f} mm"
+def verify_command(options: Namespace) -> None:
+    """Report each depth model's error at known distances, and the error budget."""
+    noise = _noise(options.sigma_px, options.speed_m_s, options.skew_ms)
+    lines, numbers, draw = list[str](), dict[str, object](), None
+    if options.source is None:
+        pair = load_pair(options.calibration, options.rig or "desk", options.fov_deg)
+        distance = parse_distances(options.distances or _TABLE)
+        if options.picture is not None:
+            raise CalibrationError(
+                "--picture: there are no measured errors to draw; give a recording or a .csv"
+            )
+    else:
+        measured = measured_from(options, parse_target(options.target))
+        pair, distance = measured.pair, parse_distances(_TABLE)
+        found = _verified(measured, noise)
+        lines += _measured_lines(measured, found)
+        numbers |= verified_json(found)
+        d, title = found.sweep.distance_m, f"Depth of rig {pair.rig.name if pair.rig is not None else ''!r}"
+        errors = {name: found.relative(name) for name in found.error_m}
+        draw = partial(draw_errors, title=title, distance_m=d, errors=errors, band=found.expected_m / d)
+    expected = _expected(pair, distance, _angles(options.angles), noise)
+    finish(options, lines + expected[0], numbers | expected[1], draw)
 
 
-def _percent(share: float) -> str:
-    return f"{'-':>8s}" if np.isnan(share) else f"{100 * share:+6.2f} %"
-
-
-def _cost(metres: float, distance_m: float) -> str:
-    return f"{1e3 * metres:6.2f} mm {100 * metres / distance_m:6.2f} %"
-
-
-_LOOK = {
-    "ideal": ("#8a8a8a", "s"),
-    "power_law": ("#c2571a", "o"),
-    "affine_disparity": ("#2b6cb0", "^"),
-    "stereo": ("#2f855a", "D"),
-}
-
-
-def draw_errors(
-    path: Path,
-    title: str,
-    distance_m: Float,
-    errors: Mapping[str, Float],
-    *,
-    used: Bool | None = None,
-    band: Float | None = None,
-) -> None:
-    """Write the plot as PNG: all models above, the good ones enlarged below.
-
-    Args:
-        distance_m: (N,) [m], rising.
-        errors: Model -> relative error of depth (N,).
-        used: (N,) False: shown hollow, rejected from a fit.
-        band: (N,) standard deviation to be expected, relative.
+def _verified(measured: Measured, noise: Noise) -> Verified:
+    """Compare a sweep with its rig.
 
     Raises:
-        RecordingError: The file cannot be written.
+        CalibrationError: There is no depth model to compare with.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # takes half a second, for a picture alone
-    from matplotlib.figure import Figure
+    pair = measured.pair
+    laws = {} if pair.rig is None else laws_of(pair.rig)
+    if not laws and pair.models is None:
+        raise CalibrationError(
+            "there is nothing to verify: give --rig NAME, a rig with power_law, affine_disparity or calibrated cameras"
+        )
+    with refusals_named(measured.data):
+        sweep = check_places(measured.sweep, pair.cameras, pair.size_px)
+    found = verify(sweep, laws, pair.models, noise)
+    if not found.error_m:
+        raise CalibrationError(
+            "the stereo model needs the columns v_left_px and v_right_px, and the rig has no law of disparity"
+        )
+    return found
 
-    figure = Figure(figsize=(9.0, 7.5), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title)
-    largest = {name: 100.0 * float(np.nanmax(np.abs(error))) for name, error in errors.items()}
-    near = min(largest.values())
-    fine = {name: error for name, error in errors.items() if largest[name] <= max(2.0, 4.0 * near)}
-    panels = [errors] if len(fine) == len(errors) else [errors, fine]
-    drawn = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0].tolist()
-    for axes, shown in zip(drawn, panels, strict=True):
-        axes.axhline(0.0, color="black", linewidth=0.8)
-        for name, error in shown.items():
-            colour, marker = _LOOK.get(name, ("#805ad5", "v"))
-            axes.plot(100 * distance_m, 100 * error, color=colour, marker=marker, markersize=4, label=name)
-            if used is not None and not used.all():
-                axes.plot(
-                    100 * distance_m[~used], 100 * error[~used], "o", markersize=11, mfc="none", color="red"
-                )
-        if band is not None:
-            noise = "±2σ of the budget"
-            axes.fill_between(
-                100 * distance_m, -200 * band, 200 * band, color="black", alpha=0.1, label=noise
+
+def _measured_lines(measured: Measured, found: Verified) -> list[str]:
+    pair = measured.pair
+    rates = ", ".join(f"{file.name} {file.frame_rate_hz:g} Hz" for file in pair.files) or "unknown"
+    lines = [
+        measured.about,
+        f"camera rate: {rates}; processed: {int(found.sweep.frames.sum())} frame pairs",
+    ]
+    for name, known in ({} if pair.rig is None else pair.rig.provenance).items():
+        if name in found.error_m and measured.data in known.data:
+            lines.append(
+                f"{name} was fitted to this very sweep ({known.date}): its error for other places is larger"
             )
-        axes.set_ylabel("error of depth [%]")
-        axes.grid(visible=True, alpha=0.3)
-        axes.legend(loc="best", fontsize=8)
-    drawn[-1].set_xlabel("distance along the first camera's axis [cm]")
-    try:
-        with replacing(path) as file:
-            figure.savefig(file, format="png")
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot write: {error.strerror}") from error
+    return lines + measured_table(found).lines()
+
+
+def _expected(pair: Pair, distance: Float, angle: Float, noise: Noise) -> tuple[list[str], dict[str, object]]:
+    """Budget and off-axis table where the cameras are known, as lines and numbers."""
+    if pair.models is None or pair.rig is None:
+        return [
+            "no budget: focal length and baseline are not known (--rig NAME; --fov-deg without intrinsics)"
+        ], {}
+    expected = budget(pair.models, distance, noise)
+    errors = {name: off_axis(law, pair.models, distance, angle) for name, law in laws_of(pair.rig).items()}
+    baseline_m = float(np.linalg.norm(pair.models[1].centre - pair.models[0].centre))
+    wanted = 0.02  # of the depth, as the published rig
+    apart_ms = 1e3 * tolerable_skew_s(wanted, baseline_m, 1.0)
+    optics = (
+        f"f = {pair.models[0].matrix[0, 0]:.1f} px, B = {1e3 * baseline_m:.1f} mm (lenses of {pair.origin});"
+        f" {100 * wanted:g} % at 1 m/s sideways needs exposures within {apart_ms:.2f} ms of each other"
+    )
+    lines = [
+        optics,
+        *budget_table(distance, expected, noise).lines(),
+        *off_axis_lines(distance, angle, errors),
+    ]
+    return lines, expected_json(distance, expected, noise, angle, errors)
+
+
+def _angles(text: str) -> Float:
+    """Angles [deg] of --angles, in front of the cameras."""
+    angles = parse_numbers(
+        text, "--angles", "FIRST:LAST:STEP in degrees, such as -20:20:10, or a list -20,0,20"
+    )
+    if not (np.abs(angles) < 90.0).all():
+        raise CalibrationError(f"--angles {text!r}: expected angles between -90 and 90 degrees")
+    return angles
+
+
+def _noise(sigma_px: float, speed_m_s: float, skew_ms: float) -> Noise:
+    for option, value in (("--sigma-px", sigma_px), ("--speed-m-s", speed_m_s), ("--skew-ms", skew_ms)):
+        if not (np.isfinite(value) and value >= 0.0):
+            raise CalibrationError(f"{option} {value:g}: expected a number that is not negative")
+    return Noise(sigma_px, speed_m_s, skew_ms * 1e-3)

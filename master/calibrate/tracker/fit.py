@@ -48,48 +48,6 @@ class Placed:
     late_s: float  # how much later the tracker's poses hold than their time stamps [s]
 
 
-def first_lag(seen: PoseTrack, tracker: PoseTrack) -> float | None:
-    """How much later the tracker's poses hold than stamped [s]; None: no overlap.
-
-    To some milliseconds.
-    """
-    most_lag_s = 0.5
-    begin = min(seen.t_s[0], tracker.t_s[0]) - most_lag_s
-    grid_s = 0.01
-    grid = np.arange(begin, max(seen.t_s[-1], tracker.t_s[-1]) + most_lag_s, grid_s)
-    ours, theirs = _rotated(seen, grid), _rotated(tracker, grid)
-    steps = round(most_lag_s / grid_s)
-    costs: list[float] = []
-    for lag in range(-steps, steps + 1):
-        moved = np.full_like(theirs, np.nan)
-        if lag >= 0:
-            moved[lag:] = theirs[: len(theirs) - lag]
-        else:
-            moved[:lag] = theirs[-lag:]
-        off = np.abs(ours - moved)
-        off = off[np.isfinite(off)]
-        least_overlap = 100  # of the grid: one second
-        costs.append(float(np.mean(np.minimum(off, 0.3))) if len(off) >= least_overlap else np.inf)
-    best = int(np.argmin(costs))
-    if not np.isfinite(costs[best]):
-        return None
-    fine = 0.0
-    if 0 < best < len(costs) - 1 and np.isfinite([costs[best - 1], costs[best + 1]]).all():
-        before, here, after = costs[best - 1 : best + 2]
-        curvature = before - 2.0 * here + after
-        fine = 0.5 * (before - after) / curvature if curvature > 0.0 else 0.0
-    return (best - steps + fine) * grid_s
-
-
-def _rotated(track: PoseTrack, t_s: Float) -> Float:
-    """Angle of rotation around each time [rad]; NaN where not known."""
-    chord_s = 0.2
-    first, _, known = track.at(t_s - 0.5 * chord_s)
-    last, _, also = track.at(t_s + 0.5 * chord_s)
-    angle = np.linalg.norm(matrix_to_rotation_vector(first.swapaxes(1, 2) @ last), axis=1)
-    return np.where(known & also, angle, np.nan)
-
-
 def first_places(seen: PoseTrack, tracker: PoseTrack, late_s: float, seed: int = 0) -> Placed | None:
     """A registration that most epochs agree with; None: too few epochs are shared.
 
@@ -223,10 +181,7 @@ class _Problem:
         v = (after[1] - before[1]) / (2.0 * dt_s)
         w = matrix_to_rotation_vector(after[0] @ before[0].swapaxes(1, 2)) / (2.0 * dt_s)
         off = np.concatenate([self.p_m - p, matrix_to_rotation_vector(self.R @ R.swapaxes(1, 2))], axis=1)
-        jacobian = np.zeros((len(at), 6, _UNKNOWNS))
-        jacobian[:, :3, 0:3] = -skew(p - self.middle_m)
-        jacobian[:, :3, 3:6] = jacobian[:, 3:, 0:3] = np.eye(3)
-        jacobian[:, 3:, 6:9] = jacobian[:, :3, 9:12] = R
+        jacobian = _jacobian(R, p - self.middle_m)
         jacobian[:, :3, 12], jacobian[:, 3:, 12] = -v, -w
         return _Rows(R, p, off, jacobian)
 
@@ -289,25 +244,34 @@ def sigma_at(fit: Fit, R: Float, p_m: Float) -> tuple[float, float]:
 
     At poses (T, 3, 3), (T, 3) of the rig; root mean square over the poses, all axes together.
     """
-    jacobian = np.zeros((len(R), 6, _UNKNOWNS))
-    jacobian[:, :3, 0:3] = -skew(p_m - fit.middle_m)
-    jacobian[:, :3, 3:6] = jacobian[:, 3:, 0:3] = np.eye(3)
-    jacobian[:, 3:, 6:9] = jacobian[:, :3, 9:12] = R
+    jacobian = _jacobian(R, p_m - fit.middle_m)
     formal = np.einsum("tij,jk,tik->ti", jacobian, fit.cov, jacobian)
-    count = len(fit.rejected)
-    change = np.einsum("tij,bj->tbi", jacobian, fit.rejected - fit.rejected.mean(axis=0))
-    left = (count - 1) / count * (change**2).sum(axis=1) if count > 1 else np.zeros_like(formal)
-    both = np.maximum(formal, left)
+    both = np.maximum(formal, _jackknife(np.einsum("tij,bj->bti", jacobian, fit.rejected)))
     place, rotation = both[:, :3].sum(axis=1).mean(), both[:, 3:].sum(axis=1).mean()
     return float(np.sqrt(place)), float(np.sqrt(rotation))
 
 
 def late_sigma_s(fit: Fit) -> float:
     """Standard deviation of the lag [s]."""
-    count = len(fit.rejected)
-    off = fit.rejected[:, 12] - fit.rejected[:, 12].mean()
-    left = (count - 1) / count * float((off**2).sum()) if count > 1 else 0.0
-    return float(np.sqrt(max(left, fit.cov[12, 12])))
+    return float(np.sqrt(max(float(_jackknife(fit.rejected[:, 12])), fit.cov[12, 12])))
+
+
+def _jackknife(values: Float) -> Float:
+    """Variance of (B, ...) values, each without another block of time (Efron 1982)."""
+    count = len(values)
+    return np.asarray((count - 1) / count * ((values - values.mean(axis=0)) ** 2).sum(axis=0), np.float64)
+
+
+def _jacobian(R: Float, arm_m: Float) -> Float:
+    """Derivatives (N, 6, 13) of predicted poses by all unknowns but the lag.
+
+    Of rotations R (N, 3, 3), `arm_m` (N, 3) from the middle.
+    """
+    jacobian = np.zeros((len(R), 6, _UNKNOWNS))
+    jacobian[:, :3, 0:3] = -skew(arm_m)
+    jacobian[:, :3, 3:6] = jacobian[:, 3:, 0:3] = np.eye(3)
+    jacobian[:, 3:, 6:9] = jacobian[:, :3, 9:12] = R
+    return jacobian
 
 
 def _refined(problem: _Problem, placed: Placed) -> tuple[Placed, float]:

@@ -1,39 +1,53 @@
-"""Registration of a tracking system to the rig and of its device to an object.
+"""Register a tracking system to the rig, and its device to an object.
 
-From one motion that both saw. The system's own frame is whatever it is: SteamVR's is y up, libsurvive's z up,
-both with a heading and an origin of their own. The registration takes that up, so none is turned beforehand;
-but a registration for one is none for the other, and none after the base stations were moved or the system
-was calibrated again.
+A motion that cameras and tracking system both see enters, live on a running master or as a file; T_rig_tracking goes
+into the rig's file, T_object_tracker and stamp_offset_us into the object's. The system's own frame is whatever it is:
+SteamVR's is y up, libsurvive's z up, both with a heading and an origin of their own. The registration takes that up,
+so none is turned beforehand; but a registration for one is none for the other, and none after the base stations were
+moved or the system was calibrated again.
 """
 
+from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 from msgspec.structs import replace
 
 from common.arrays import Float
-from common.calibration import Provenance, RigCalibration
+from common.calibration import RigCalibration, load
 from common.calibration.object_profile import ObjectProfile
-from common.errors import FitError
+from common.command_line import echo
+from common.errors import CalibrationError, FitError, RecordingError
 from common.geometry.transforms import rotation_vector_to_matrix
-from common.messages import ObjectPose, TrackerPose
-from master.calibrate.tracker.fit import (
-    Fit,
+from common.messages import ObjectPose, ObjectSource, TrackerPose
+from common.recording.recorded_files import read_npz, write_npz
+from master.calibrate.report import finish
+from master.calibrate.session import Session, listening
+from master.calibrate.tracker.fit import Fit, first_places, fit_registration, late_sigma_s, sigma_at
+from master.calibrate.tracker.tracks import (
+    MOTION,
+    Coverage,
+    coverage_of,
     first_lag,
-    first_places,
-    fit_registration,
-    late_sigma_s,
-    sigma_at,
+    guide,
+    object_track,
+    shared_epochs,
+    tracker_track,
 )
-from master.calibrate.tracker.tracks import Coverage, coverage_of, object_track, shared_epochs, tracker_track
-from master.calibrate.tree_files import matrix_of, provenance
+from master.calibrate.tree_files import (
+    load_marker_rig,
+    matrix_of,
+    provenance,
+    refusals_named,
+    rig_in_tree,
+    write_object,
+    write_rig,
+)
 
 TOOL = "calibrate tracker"
-MOTION = (
-    "hold the object with the tracker on it before the cameras for twenty seconds: turn it about all its axes, a"
-    " quarter turn and back, and carry it to all sides"
-)
 _SIGMA_M, _SIGMA_RAD, _LATE_S = 3e-3, np.radians(1.0), 5e-3  # standard deviations, at most
 _LEFT_RAD = np.radians(5.0)
 # What is off in the same way all the time, a tag that sits a little aside, no leaving out of a part shows: of what is
@@ -49,7 +63,6 @@ class Registration:
     fit: Fit
     coverage: Coverage  # what the motion was
     figures: dict[str, float]  # quantity with its unit -> value: residuals, and standard deviations
-    report: tuple[str, ...]  # lines for a person
 
 
 def register(objects: Sequence[ObjectPose], tracked: Sequence[TrackerPose]) -> Registration:
@@ -79,7 +92,7 @@ def register(objects: Sequence[ObjectPose], tracked: Sequence[TrackerPose]) -> R
     fit = fit_registration(seen, device, first)
     figures = figures_of(fit)
     refuse(fit, figures, coverage)
-    return Registration(fit, coverage, figures, report_lines(fit, figures, coverage))
+    return Registration(fit, coverage, figures)
 
 
 def figures_of(fit: Fit) -> dict[str, float]:
@@ -141,12 +154,14 @@ def refuse(fit: Fit, figures: dict[str, float], coverage: Coverage) -> None:
         raise FitError("; ".join([*wanting, *coverage.missing]) + f". {MOTION[0].upper()}{MOTION[1:]}")
 
 
-def report_lines(fit: Fit, figures: dict[str, float], coverage: Coverage) -> tuple[str, ...]:
+def report_lines(found: Registration) -> tuple[str, ...]:
     """The result for a person."""
+    fit, figures, coverage = found.fit, found.figures, found.coverage
     placed = fit.placed
     system, device = (1e3 * T[:3, 3] for T in (placed.T_rig_tracking, placed.T_object_tracker))
     shown = {name: f"{value:.2f}" for name, value in figures.items()}
-    left = f"left: {shown['position_mm']} mm, {shown['rotation_deg']} deg; {100 * figures['outlier_share']:.0f} % stray"
+    outliers = f"{100 * figures['outlier_share']:.0f} % outliers"
+    left = f"left: {shown['position_mm']} mm, {shown['rotation_deg']} deg; {outliers}"
     lag = f"its poses hold {1e3 * placed.late_s:+.1f} ms after their stamps"
     sure = f"{shown['position_sigma_mm']} mm, {shown['rotation_sigma_deg']} deg"
     return (
@@ -165,7 +180,7 @@ def documented(
 ) -> tuple[RigCalibration, ObjectProfile]:
     """Rig and object with what was measured, and where that comes from."""
     placed = found.fit.placed
-    how: Provenance = provenance(
+    how = provenance(
         TOOL,
         (source,),
         {name: round(value, 4) for name, value in found.figures.items()},
@@ -183,3 +198,180 @@ def documented(
         provenance=profile.provenance | {"T_object_tracker": how},
     )
     return new_rig, new_object
+
+
+def tracker(options: Namespace) -> None:
+    """Register a tracking system (Lighthouse) to the rig and its device to an object."""
+    if options.live == (options.motion is not None):
+        raise CalibrationError("give --live, or --motion FILE of a motion that was kept")
+    rig = load_marker_rig(options.calibration, options.rig)
+    profile = profile_of(options.calibration, options.name, options.device)
+    if options.motion is None:
+        streams = {"object": profile.name, "device": profile.tracker}
+        with listening(options.bus, streams, _pose) as receive:
+            seen = guide(Session(receive), options.seconds)
+        objects, tracked, source = seen.objects, seen.tracked, "live"
+        if options.keep is not None:
+            write_motion(options.keep, objects, tracked)
+            echo(f"kept {options.keep}")
+    else:
+        objects, tracked = read_motion(options.motion, profile)
+        source = options.motion.name
+    with refusals_named(source):
+        found = register(objects, tracked)
+
+    def write(out: Path) -> dict[Path, str]:
+        path = out / "objects" / f"{profile.name}.json"
+        there = load(path, ObjectProfile) if path.exists() else profile
+        there = replace(there, tracker=profile.tracker)
+        new_rig, new_object = documented(rig_in_tree(out, options.rig, rig), there, found, source)
+        return {
+            write_object(out, new_object): "T_object_tracker, stamp_offset_us",
+            write_rig(out, options.rig, new_rig): "T_rig_tracking",
+        }
+
+    finish(options, report_lines(found), summary(found), partial(draw_registration, found=found), write)
+
+
+def _pose(message: object) -> ObjectPose | TrackerPose | None:
+    return message if isinstance(message, ObjectPose | TrackerPose) else None
+
+
+_KEYS = {"t_ns": (), "position_m": (3,), "orientation_wxyz": (4,)}
+_FIX = "it needs t_ns, position_m and orientation_wxyz, each with object_ and tracker_ before it (docs/tracker.md)"
+
+
+def write_motion(path: Path, objects: Sequence[ObjectPose], tracked: Sequence[TrackerPose]) -> None:
+    """Save the poses of a motion as an .npz file that `read_motion` reads.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    own = [one for one in objects if one.tracked]
+    arrays = {
+        "object_t_ns": np.array([one.t_ns for one in own], np.int64),
+        "object_position_m": np.array([one.position_m for one in own]).reshape(-1, 3),
+        "object_orientation_wxyz": np.array([one.orientation_wxyz for one in own]).reshape(-1, 4),
+        "object_cov": np.array([one.cov for one in own]).reshape(-1, 6, 6),
+        "object_source": np.array([one.source for one in own], np.uint8),
+        "tracker_t_ns": np.array([one.t_ns for one in tracked], np.int64),
+        "tracker_position_m": np.array([one.position_m for one in tracked]).reshape(-1, 3),
+        "tracker_orientation_wxyz": np.array([one.orientation_wxyz for one in tracked]).reshape(-1, 4),
+    }
+    try:
+        write_npz(path, arrays)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot write: {error.strerror}") from error
+
+
+def read_motion(path: Path, profile: ObjectProfile) -> tuple[list[ObjectPose], list[TrackerPose]]:
+    """Read poses of one object from cameras and tracker, on one clock; NaN: lost.
+
+    Raises:
+        RecordingError: The file is missing or broken, or lacks a key; the text states which.
+    """
+    names = [f"{who}_{key}" for who in ("object", "tracker") for key in _KEYS]
+    arrays = read_npz(path, names, _FIX, also=("object_cov", "object_source"))
+    sizes = {who: _checked(path, arrays, who) for who in ("object", "tracker")}
+    cov = arrays.get("object_cov", np.full((sizes["object"], 6, 6), np.nan))
+    source = arrays.get("object_source", np.full(sizes["object"], ObjectSource.TAGS))
+    if cov.shape != (sizes["object"], 6, 6) or source.shape != (sizes["object"],):
+        raise RecordingError(f"{path}: object_cov, object_source: not one for each of object_t_ns")
+    try:
+        objects = [
+            ObjectPose(
+                profile.name, int(t), p, q, c, float("nan"), int(s), bool(np.isfinite(p).all()), 1, 1, False
+            )
+            for t, p, q, c, s in zip(*(arrays[f"object_{key}"] for key in _KEYS), cov, source, strict=True)
+        ]
+        name = profile.tracker or profile.name
+        tracked = [
+            TrackerPose(name, 0, k, int(t), p, q)
+            for k, (t, p, q) in enumerate(zip(*(arrays[f"tracker_{key}"] for key in _KEYS), strict=True))
+        ]
+    except (ValueError, TypeError) as error:
+        raise RecordingError(f"{path}: {error}") from error
+    return objects, tracked
+
+
+def _checked(path: Path, arrays: dict[str, Float], who: str) -> int:
+    """The number of poses; refuse keys that have another, or no numbers."""
+    count = len(arrays[f"{who}_t_ns"]) if arrays[f"{who}_t_ns"].ndim == 1 else -1
+    for key, shape in _KEYS.items():
+        array = arrays[f"{who}_{key}"]
+        if array.shape != (count, *shape) or array.dtype.kind not in "fiu":
+            raise RecordingError(f"{path}: {who}_{key}: shape {array.shape}, {_FIX}")
+    return count
+
+
+def profile_of(calibration: Path, name: str, device: str | None) -> ObjectProfile:
+    """The object, with the name of the device on it.
+
+    Raises:
+        CalibrationError: The file is missing or broken, no device is named, or cameras cannot see the object.
+    """
+    path = calibration / "objects" / f"{name}.json"
+    profile = load(path, ObjectProfile)
+    if device is not None:
+        profile = replace(profile, tracker=device)
+    if profile.tracker is None:
+        raise CalibrationError(
+            f"{path}: tracker: no device is named: write its name there, or give --device NAME"
+        )
+    if not profile.markers and profile.tags is None:
+        raise CalibrationError(
+            f"{path}: neither markers nor tags: cameras cannot see where the object is, and nothing else shows where "
+            "the tracker sits on it"
+        )
+    return profile
+
+
+def summary(found: Registration) -> dict[str, object]:
+    """What was measured, as numbers."""
+    placed = found.fit.placed
+    return {
+        "T_rig_tracking": placed.T_rig_tracking.tolist(),
+        "T_object_tracker": placed.T_object_tracker.tolist(),
+        "late_ms": 1e3 * placed.late_s,
+        "epochs": len(found.fit.t_s),
+        "shared_s": found.coverage.shared_s,
+        **found.figures,
+    }
+
+
+def draw_registration(path: Path, found: Registration) -> None:
+    """Draw the object's path (dots: cameras; lines: tracker), and offsets over time.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    from master.calibrate.picture import BLUE, GREEN, GREY, ORANGE, draw_over_time, figure_of, save_figure
+
+    fit = found.fit
+    figure = figure_of((17.0, 8.4))
+    figure.suptitle("\n".join(report_lines(found)[:2]))
+    above, side, place, rotation = figure.subplots(2, 2).ravel()
+    seen = 1e3 * (fit.p_m + fit.off[:, :3])
+    track_mm = 1e3 * fit.p_m.copy()
+    track_mm[np.diff(fit.t_s, prepend=fit.t_s[0]) > 0.2] = np.nan  # a gap is no way
+    for axes, (a, b), title in ((above, (0, 2), "from above [mm]"), (side, (2, 1), "from the side [mm]")):
+        axes.plot(track_mm[:, a], track_mm[:, b], "-", color=GREY, linewidth=0.8, label="tracker")
+        for own, look, colour, name in (
+            (~fit.outlier, ".", BLUE, "cameras"),
+            (fit.outlier, "x", ORANGE, "outlier"),
+        ):
+            axes.plot(seen[own, a], seen[own, b], look, color=colour, markersize=3, label=name)
+        axes.set(title=f"{title}: rig {'xyz'[a]}, {'xyz'[b]}")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.legend(fontsize=8)
+    side.invert_yaxis()  # y of the rig points down
+    fine = ~fit.outlier
+    for axes, columns, unit, title in (
+        (place, slice(0, 3), 1e3, "cameras against tracker: place [mm]"),
+        (rotation, slice(3, 6), np.degrees(1.0), "cameras against tracker: turn [deg]"),
+    ):
+        off = unit * fit.off[fine, columns]
+        draw_over_time(axes, fit.t_s[fine], off, np.zeros(len(off), np.bool_), "xyz", (BLUE, ORANGE, GREEN))
+        axes.axhline(0.0, color=GREY, linewidth=0.8)
+        axes.set(title=title)
+    save_figure(figure, path)

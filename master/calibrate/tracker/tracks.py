@@ -10,12 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
+from common.errors import FitError
 from common.geometry.transforms import (
     matrix_to_rotation_vector,
     quaternion_to_matrix,
     rotation_vector_to_matrix,
 )
 from common.messages import ObjectPose, ObjectSource, TrackerPose
+from master.calibrate.observations import thinned
+from master.calibrate.session import Progress, Session
 
 _NOT_ITS_OWN = (ObjectSource.TRACKER, ObjectSource.HELD, ObjectSource.NONE)
 
@@ -92,10 +95,49 @@ def shared_epochs(seen: PoseTrack, tracker: PoseTrack, late_s: float, most: int)
     """
     if len(seen) == 0 or len(tracker) < 2:
         return np.zeros(0, np.int64)
-    rows = np.flatnonzero(tracker.at(seen.t_s - late_s)[2])
-    if len(rows) <= most:
-        return rows
-    return rows[np.unique(np.linspace(0, len(rows) - 1, most).astype(np.int64))]
+    return thinned(np.flatnonzero(tracker.at(seen.t_s - late_s)[2]), most)
+
+
+def first_lag(seen: PoseTrack, tracker: PoseTrack) -> float | None:
+    """How much later the tracker's poses hold than stamped [s]; None: no overlap.
+
+    To some milliseconds.
+    """
+    most_lag_s = 0.5
+    begin = min(seen.t_s[0], tracker.t_s[0]) - most_lag_s
+    grid_s = 0.01
+    grid = np.arange(begin, max(seen.t_s[-1], tracker.t_s[-1]) + most_lag_s, grid_s)
+    ours, theirs = _rotated(seen, grid), _rotated(tracker, grid)
+    steps = round(most_lag_s / grid_s)
+    costs: list[float] = []
+    for lag in range(-steps, steps + 1):
+        moved = np.full_like(theirs, np.nan)
+        if lag >= 0:
+            moved[lag:] = theirs[: len(theirs) - lag]
+        else:
+            moved[:lag] = theirs[-lag:]
+        off = np.abs(ours - moved)
+        off = off[np.isfinite(off)]
+        least_overlap = 100  # of the grid: one second
+        costs.append(float(np.mean(np.minimum(off, 0.3))) if len(off) >= least_overlap else np.inf)
+    best = int(np.argmin(costs))
+    if not np.isfinite(costs[best]):
+        return None
+    fine = 0.0
+    if 0 < best < len(costs) - 1 and np.isfinite([costs[best - 1], costs[best + 1]]).all():
+        before, here, after = costs[best - 1 : best + 2]
+        curvature = before - 2.0 * here + after
+        fine = 0.5 * (before - after) / curvature if curvature > 0.0 else 0.0
+    return (best - steps + fine) * grid_s
+
+
+def _rotated(track: PoseTrack, t_s: Float) -> Float:
+    """Angle of rotation around each time [rad]; NaN where not known."""
+    chord_s = 0.2
+    first, _, known = track.at(t_s - 0.5 * chord_s)
+    last, _, also = track.at(t_s + 0.5 * chord_s)
+    angle = np.linalg.norm(matrix_to_rotation_vector(first.swapaxes(1, 2) @ last), axis=1)
+    return np.where(known & also, angle, np.nan)
 
 
 LEAST_S, LEAST_ROTATION_RAD, LEAST_WAY_M = 8.0, np.radians(45.0), 0.10
@@ -197,3 +239,76 @@ def _rms_rates(track: PoseTrack, t_s: Float) -> tuple[float, float]:
 
 def _rms(vectors: Float) -> float:
     return float(np.sqrt((vectors * vectors).sum(axis=1).mean()))
+
+
+MOTION = (
+    "hold the object with the tracker on it before the cameras for twenty seconds: turn it about all its axes, a"
+    " quarter turn and back, and carry it to all sides"
+)
+
+
+class SeenMotion:
+    """Push machine of the guided motion.
+
+    State: all poses of the motion, and the lag once known.
+    """
+
+    def __init__(self) -> None:
+        self.objects: list[ObjectPose] = []
+        self.tracked: list[TrackerPose] = []
+        self._lag_s: float | None = None
+
+    def push(self, message: ObjectPose | TrackerPose) -> None:
+        """Take one pose, of the object by cameras or of the device."""
+        if isinstance(message, TrackerPose):
+            self.tracked.append(message)
+        elif message.tracked and message.source in (ObjectSource.MARKERS, ObjectSource.TAGS):
+            self.objects.append(message)
+
+    def progress(self, now_ns: int, since_s: float) -> Progress:
+        """How far it is at a time, so long after the beginning, and what is missing."""
+        silent = self.silent(now_ns) if since_s > SILENT_S else ""
+        nothing = Progress(0.0, "", silent or "waiting for cameras and tracker")
+        if not (self.objects and self.tracked):
+            return nothing
+        zero_ns = min(self.objects[0].t_ns, self.tracked[0].t_ns)
+        seen, device = object_track(self.objects, zero_ns), tracker_track(self.tracked, zero_ns)
+        if len(seen) < 2 or len(device) < 2:
+            return nothing
+        found = coverage_of(seen, device, self._lag_s or 0.0)
+        if self._lag_s is None and found.shared_s > 5.0:
+            self._lag_s = first_lag(seen, device)
+        enough_s = 15.0  # of both, when all turns are there: more of it makes the result surer
+        enough = not found.missing and found.shared_s >= enough_s
+        hint = silent or next(iter(found.missing), "done" if enough else "go on like this")
+        return Progress(found.share, found.line(), hint, enough)
+
+    def silent(self, now_ns: int) -> str:
+        """The side that sends nothing just now, and what to look at; empty: both send."""
+        if not _recent([one.t_ns for one in self.tracked[-1:]], now_ns):
+            return "no tracker data received: is `phalanx-slave run --tracker` running, and does the master know it?"
+        if not np.isfinite([one.position_m for one in self.tracked[-20:]]).any():
+            return "the tracker does not know where it is: let it see a base station"
+        if not _recent([one.t_ns for one in self.objects[-1:]], now_ns):
+            return "the cameras do not see the object: markers or tags to the cameras"
+        return ""
+
+
+def guide(session: Session[ObjectPose | TrackerPose], longest_s: float) -> SeenMotion:
+    """Lead a person through the motion until it is enough, or the time is over.
+
+    Raises:
+        FitError: Nothing was received from the cameras or the tracker all the time.
+    """
+    seen, clock = SeenMotion(), session.clock
+    session.follow(MOTION, seen.push, lambda since_s: seen.progress(clock.now_ns(), since_s), longest_s)
+    if not (seen.objects and seen.tracked):
+        raise FitError(seen.silent(clock.now_ns()) or f"nothing was seen: {MOTION}")
+    return seen
+
+
+SILENT_S = 3.0
+
+
+def _recent(t_ns: list[int], now_ns: int) -> bool:
+    return bool(t_ns) and now_ns - t_ns[0] < SILENT_S * 1e9

@@ -1,10 +1,9 @@
 """Job runs a calibration and reads its progress from its output.
 
-It runs its stages one after the other. Progress is a line with `7 of 25`, `40 %`, or a step with its number.
+It runs its stages one after the other. Progress is what their guided sessions print (`share_of`).
 Results are written below the job's own folder, and taken over into the tree in use by `Job.use`.
 """
 
-import re
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -15,22 +14,9 @@ from pathlib import Path
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, parse
 from common.calibration.object_profile import ObjectProfile
 from common.errors import CalibrationError, PhalanxError
+from master.calibrate.session import share_of
 from master.console.local import LocalProcess, LocalProcesses
 from master.console.setup.files import replace_file
-
-_COUNT = re.compile(r"\b(\d+) of (\d+)\b")
-_SHARE = re.compile(r"\b(\d{1,3}) %")
-
-
-def progress(lines: Iterable[str]) -> float | None:
-    """Return the share of work that the last line with one reports as done, 0..1."""
-    last = None
-    for line in lines:
-        if (found := _COUNT.search(line)) and int(found[2]):
-            last = min(int(found[1]) / int(found[2]), 1.0)
-        elif found := _SHARE.search(line):
-            last = min(int(found[1]) / 100, 1.0)
-    return last
 
 
 def fault(lines: Iterable[str]) -> str:
@@ -114,7 +100,7 @@ class Job:
         """Return the progress over all stages, 0..1; None if none is reported."""
         if self.state is JobState.DONE:
             return 1.0
-        own = progress(line for one in list(self._now.values()) for line in list(one.lines))
+        own = share_of(line for one in list(self._now.values()) for line in list(one.lines))
         if own is None:
             return None if len(self._stages) == 1 else self._place / len(self._stages)
         return (self._place + own) / len(self._stages)

@@ -9,12 +9,13 @@ from msgspec.structs import replace
 
 from common.bus.keys import rig_key
 from common.errors import CalibrationError
+from master.calibrate.session import share_of
 from master.cli.table import CALIBRATIONS
 from master.commands.keys import make
 from master.console.local import LocalProcesses
 from master.console.setup.commands import VIEWS, Commands, arguments_of, epoch_of, fields_of
 from master.console.setup.files import CameraPlan, Plan, write_cameras, write_rig
-from master.console.setup.job import Job, JobState, Stage, fault, progress
+from master.console.setup.job import Job, JobState, Stage, fault
 from master.console.setup.panel_lens import judged
 from master.console.setup.wizards import FILLED, WIZARDS
 from master.console.state import ConsoleSettings
@@ -72,11 +73,11 @@ def test_values_become_the_command_line() -> None:
 
 
 def test_lines_show_the_progress() -> None:
-    assert progress(["view 7 of 25: left and right; for left, tilt it"]) == 7 / 25
-    assert progress(["fitting  40 %"]) == 0.4
-    assert progress(["left: hold it still"]) is None
-    assert progress(["view 1 of 4: a", "left: hold it still", "view 2 of 4: b", "hold"]) == 0.5
-    assert progress([]) is None
+    assert share_of(["view 7 of 25: left and right; for left, tilt it"]) == 7 / 25
+    assert share_of(["fitting  40 %"]) == 0.4
+    assert share_of(["left: hold it still"]) is None
+    assert share_of(["view 1 of 4: a", "left: hold it still", "view 2 of 4: b", "hold"]) == 0.5
+    assert share_of([]) is None
 
 
 def test_what_went_wrong_is_the_commands_own_sentence() -> None:

@@ -9,7 +9,7 @@ from common.calibration import CameraCalibration, RigCalibration, load
 from common.geometry.camera_model import CameraModel
 from common.sim.board import BOARD, BoardRenderer
 from common.sim.scenes import DISTANCES_M, MARKER, CardScene
-from master.calibrate.depth.fit import FITS
+from master.calibrate.depth.fit import FITS, relative_error
 from master.calibrate.depth.source import pair_of, parse_target, straightened
 from master.calibrate.depth.sweep import Sweep, checked
 from master.fabrik.depth import law_residual
@@ -27,7 +27,7 @@ def sweep() -> Sweep:
     """One frame of each camera at each distance."""
     scene, index = CardScene(RIG, CAMERAS, 7), RIG.markers.index(MARKER)
     places = range(len(DISTANCES_M))
-    uv = np.empty((2, len(DISTANCES_M), 2))
+    uv = np.empty((len(DISTANCES_M), 2, 2))
     area, sigma = np.empty(uv.shape[:2]), np.empty(uv.shape[:2])
     for c, name in enumerate(RIG.cameras):
         renderer, detector = (
@@ -37,16 +37,8 @@ def sweep() -> Sweep:
         for k in places:
             t_s = k * (BOARD.held_s + BOARD.moved_s)
             found = detector.push(renderer.render(t_s), round(t_s * 1e9))
-            uv[c, k], area[c, k], sigma[c, k] = found.uv[index], found.area[index], found.sigma_px[index]
-    return Sweep(
-        np.array(DISTANCES_M),
-        uv[0, :, 0] - uv[1, :, 0],
-        uv,
-        area,
-        np.hypot(*sigma),
-        np.ones(len(DISTANCES_M), np.int64),
-        tuple(f"place {k}" for k in places),
-    )
+            uv[k, c], area[k, c], sigma[k, c] = found.uv[index], found.area[index], found.sigma_px[index]
+    return Sweep.of(np.array(DISTANCES_M), uv, area, [f"place {k}" for k in places], np.hypot(*sigma.T))
 
 
 def test_the_laws_agree_with_the_geometry(sweep: Sweep) -> None:
@@ -56,6 +48,6 @@ def test_the_laws_agree_with_the_geometry(sweep: Sweep) -> None:
     assert good.size == len(DISTANCES_M)
     # A power law is not that of two cameras: 0.5 % is what it misses by; an affine one misses by the noise.
     for name, most in (("power_law", 0.01), ("affine_disparity", 0.004)):
-        law, error = FITS[name](good.disparity_px, good.distance_m)
-        assert np.abs(error).max() < most, name
+        law, _ = FITS[name](good.disparity_px, good.distance_m)
+        assert np.abs(relative_error(law, good.disparity_px, good.distance_m)).max() < most, name
         assert law_residual(law, MODELS, RIG.volume)[0] < most, name

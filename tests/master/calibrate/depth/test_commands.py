@@ -131,6 +131,20 @@ def test_what_is_wrong_stays_out_of_the_tree(tmp_path: Path) -> None:
     assert (calib / "rigs" / "desk.json").read_bytes() == before
 
 
+@pytest.mark.parametrize(("unit_m", "ratio"), [(0.3048, "3.3"), (0.1, "9.9"), (0.5, "2")])
+def test_distances_that_are_no_metres_are_refused_where_the_cameras_are_known(
+    tmp_path: Path, unit_m: float, ratio: str
+) -> None:
+    calib, csv = tree(tmp_path), tmp_path / "s.csv"
+    lines = [
+        f"{d / unit_m:.4f},{x:.3f}" for d, x in zip(STEPS, RIG.disparity(STEPS), strict=True) if d < 0.95
+    ]
+    csv.write_text("\n".join(["distance_m,disparity_px", *lines]))
+    with pytest.raises(FitError, match=rf"s.csv: the distances are {ratio} times .* give metres, not feet"):
+        run("depth", csv, "--calibration", calib, "--rig", "desk", "--out", calib)
+    assert load(calib / "rigs" / "desk.json", RigCalibration).power_law is None
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.arrays import Float
+from common.errors import FitError
 from master.calibrate.depth.fit import (
     FITS,
     fit_affine_disparity,
@@ -25,14 +26,18 @@ RIG = AffineDisparity(37.3, 2.64)  # f B of the published optics, and 0.3 deg of
 
 
 def test_the_published_table_gives_the_published_constants() -> None:
-    law, residual = fit_power_law(PUBLISHED_PX, PUBLISHED_M)
+    law, sd = fit_power_law(PUBLISHED_PX, PUBLISHED_M)
+    residual = relative_error(law, PUBLISHED_PX, PUBLISHED_M)
     assert law.k_m == pytest.approx(45.433, rel=5e-4)
     assert law.z == pytest.approx(-1.035, abs=2e-4)
     assert np.abs(residual).max() < 2e-4
+    assert 0.0 < sd[0] < 0.01
+    assert 0.0 < sd[1] < 1e-4
 
 
 def test_a_yawed_pair_has_nearly_the_published_constants() -> None:
-    law, residual = fit_power_law(RIG.disparity(SWEEP_M), SWEEP_M)
+    law, _ = fit_power_law(RIG.disparity(SWEEP_M), SWEEP_M)
+    residual = relative_error(law, RIG.disparity(SWEEP_M), SWEEP_M)
     assert law.k_m == pytest.approx(45.433, rel=0.01)
     assert law.z == pytest.approx(-1.035, rel=0.01)
     assert 0.001 < np.abs(residual).mean() < 0.01  # a power law is not the law of two cameras
@@ -40,16 +45,32 @@ def test_a_yawed_pair_has_nearly_the_published_constants() -> None:
 
 @given(st.floats(20.0, 60.0), st.floats(-1.2, -0.9))
 def test_an_exact_power_law_is_found_again(k: float, z: float) -> None:
-    law, residual = fit_power_law(PowerLaw(k, z).disparity(SWEEP_M), SWEEP_M)
+    law, _ = fit_power_law(PowerLaw(k, z).disparity(SWEEP_M), SWEEP_M)
+    residual = relative_error(law, PowerLaw(k, z).disparity(SWEEP_M), SWEEP_M)
     assert (law.k_m, law.z) == pytest.approx((k, z), rel=1e-9)
     assert np.abs(residual).max() < 1e-9
 
 
 @given(st.floats(10.0, 100.0), st.floats(-8.0, 8.0))
 def test_an_exact_affine_law_is_found_again(a: float, x0: float) -> None:
-    law, residual = fit_affine_disparity(AffineDisparity(a, x0).disparity(SWEEP_M), SWEEP_M)
+    law, _ = fit_affine_disparity(AffineDisparity(a, x0).disparity(SWEEP_M), SWEEP_M)
+    residual = relative_error(law, AffineDisparity(a, x0).disparity(SWEEP_M), SWEEP_M)
     assert (law.a_m_px, law.x0_px) == pytest.approx((a, x0), rel=1e-9, abs=1e-9)
     assert np.abs(residual).max() < 1e-9
+
+
+def test_standard_deviations_are_those_of_repeated_sweeps() -> None:
+    rng, found, stated = np.random.default_rng(8), [], []
+    for _ in range(200):
+        law, sd = fit_affine_disparity(RIG.disparity(SWEEP_M + rng.normal(0.0, 1e-3, 17) * SWEEP_M), SWEEP_M)
+        found.append((law.a_m_px, law.x0_px))
+        stated.append(sd)
+    assert np.std(found, axis=0) == pytest.approx(np.sqrt(np.mean(np.square(stated), axis=0)), rel=0.15)
+
+
+def test_places_of_one_disparity_determine_no_law() -> None:
+    with pytest.raises(FitError, match="all places have the same disparity"):
+        fit_power_law(np.full(3, 50.0), np.array([0.5, 0.6, 0.7]))
 
 
 def in_disparity(disparity: Float, distance: Float) -> AffineDisparity:

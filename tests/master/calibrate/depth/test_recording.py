@@ -13,7 +13,7 @@ from common.arrays import Float
 from common.errors import CalibrationError, RecordingError
 from common.recording.frame_recording import FrameRecording, open_recording
 from common.recording.recorded_files import write_npz
-from master.calibrate.depth.source import Pairs, by_file, by_list, by_truth, read_pairs, still_runs
+from master.calibrate.depth.source import Pairs, by_file, by_list, by_truth, pair_of, read_pairs, still_runs
 from master.calibrate.depth.sweep import Sweep, parse_distances, read_table, write_table
 from master.fabrik.depth import AffineDisparity
 
@@ -124,6 +124,15 @@ def pairs_of(tmp_path: Path, distances: Sequence[float], stand: int, move: int) 
     return read_pairs(opened, detections(tmp_path, t, x), CAMERAS, None)[0]
 
 
+def test_a_recording_without_a_camera_of_its_rig_is_refused(tmp_path: Path) -> None:
+    t, _ = process_noise([1.0], 20, 0)
+    manifest = recording(tmp_path / "r", t).manifest
+    with pytest.raises(
+        CalibrationError, match=r"camera 'right', the recording has not; it has left: record both"
+    ):
+        pair_of(manifest.marker_rig(), {"left": manifest.cameras["left"]})
+
+
 def test_stretches_at_rest_are_found_and_averaged(tmp_path: Path) -> None:
     distances = [1.0, 0.8, 0.6, 0.4, 0.2]
     pairs = pairs_of(tmp_path, distances, 30, 12)
@@ -205,17 +214,13 @@ def test_a_rendered_recording_brings_its_distances(tmp_path: Path) -> None:
 
 
 def test_a_table_comes_back_as_it_was_written(tmp_path: Path) -> None:
-    uv = np.arange(12.0).reshape(2, 3, 2)
-    x = uv[0, :, 0] - uv[1, :, 0]
-    ones = np.ones(3)
-    sweep = Sweep(
-        np.array([0.2, 0.3, 0.4]), x, uv, np.full((2, 3), 50.0), ones, ones.astype(np.int64), ("a", "b", "c")
-    )
+    uv = np.arange(12.0).reshape(3, 2, 2)
+    sweep = Sweep.of(np.array([0.2, 0.3, 0.4]), uv, np.full((3, 2), 50.0), ("a", "b", "c"))
     write_table(tmp_path / "s.csv", sweep)
     back = read_table(tmp_path / "s.csv")
     assert back.distance_m.tolist() == [0.2, 0.3, 0.4]
     assert back.uv.tolist() == uv.tolist()
-    assert back.area_px2.tolist() == [[50.0] * 3] * 2
+    assert back.area_px2.tolist() == [[50.0] * 2] * 3
     assert back.place == ("line 2", "line 3", "line 4")
 
 

@@ -14,8 +14,9 @@ from common.arrays import Float
 from common.clock import SystemClock
 from common.errors import FitError
 from common.messages import ImuSample, MarkerDetections
-from master.calibrate.depth.session import Meter, Reading, measure, run_session
+from master.calibrate.depth.session import Meter, guide, read
 from master.calibrate.depth.sweep import Sweep, checked, read_table, write_table
+from master.calibrate.session import Person, Session, share_of
 from master.fabrik.depth import AffineDisparity
 from master.run.ingest import Ingest
 from slave.uplink import Uplink
@@ -43,7 +44,7 @@ def target(distance: float, camera: str) -> Float:
     return np.array([319.5 + (half if camera == "left" else -half), 239.5])
 
 
-def fed(meter: Meter, uv: dict[str, Float], rate_hz: float = 60.0) -> tuple[Reading | None, int]:
+def fed(meter: Meter, uv: dict[str, Float], rate_hz: float = 60.0) -> tuple[Sweep | None, int]:
     """Push frames (T, 2) of each camera in turn; the reading, and the frame it came with."""
     for i in range(len(uv["left"])):
         for camera in CAMERAS:
@@ -60,12 +61,13 @@ def still(frames: int, noise: float = 0.06, seed: int = 3) -> dict[str, Float]:
 
 
 def test_a_target_at_rest_is_averaged_over_a_second() -> None:
-    reading, frame = fed(Meter(CAMERAS, INDEX, 30, 1.0), still(200))
+    meter = Meter(CAMERAS, INDEX, 30, 1.0)
+    reading, frame = fed(meter, still(200))
     assert reading is not None
     assert frame == 60
-    assert reading.uv[0, 0] - reading.uv[1, 0] == pytest.approx(RIG.disparity(np.array(0.5)), abs=0.05)
-    assert reading.sigma_px == pytest.approx(0.06 * 2**0.5, rel=0.4)
-    assert reading.rate_hz == pytest.approx([60.0, 60.0], rel=1e-6)
+    assert reading.disparity_px[0] == pytest.approx(RIG.disparity(np.array(0.5)), abs=0.05)
+    assert reading.sigma_px[0] == pytest.approx(0.06 * 2**0.5, rel=0.4)
+    assert meter.rates_hz == pytest.approx([60.0, 60.0], rel=1e-6)
 
 
 def test_a_slow_camera_gives_enough_frames_too() -> None:
@@ -88,7 +90,7 @@ def test_a_moving_target_is_refused_until_it_stands(way: str) -> None:
     reading, frame = fed(Meter(CAMERAS, INDEX, 30, 1.0), uv)
     assert reading is not None
     assert frame > 170
-    assert reading.uv[0, 0] - reading.uv[1, 0] == pytest.approx(RIG.disparity(np.array(0.5)), abs=0.05)
+    assert reading.disparity_px[0] == pytest.approx(RIG.disparity(np.array(0.5)), abs=0.05)
 
 
 def test_a_target_outside_one_image_is_reported_with_the_camera() -> None:
@@ -120,7 +122,7 @@ class Queue:
 def test_nobody_sends_and_the_reason_is_reported() -> None:
     clock = ManualClock()
     with pytest.raises(FitError, match="no frames from left and right"):
-        measure(Queue(clock, []).get, Meter(CAMERAS, INDEX, 8, 1.0), clock, lambda share: None)
+        read(Session(Queue(clock, []).get, clock=clock), Meter(CAMERAS, INDEX, 8, 1.0))
     assert clock.t_ns >= 10_000_000_000
 
 
@@ -131,7 +133,7 @@ def test_samples_of_an_imu_between_the_frames_are_passed_over() -> None:
         t_ns = round((1 + i) * 1e8)
         messages.append(ImuSample("palm-imu", 1, i, t_ns, zero, zero, zero, np.eye(4)[0]))
         messages += [sees(camera, 1, i, t_ns, uv[camera][i]) for camera in CAMERAS]
-    reading = measure(Queue(clock, messages).get, Meter(CAMERAS, INDEX, 30, 1.0), clock, lambda share: None)
+    reading = read(Session(Queue(clock, messages).get, clock=clock), Meter(CAMERAS, INDEX, 30, 1.0))
     assert (reading.frames >= 30).all()
 
 
@@ -197,10 +199,10 @@ def test_a_whole_session_over_the_wire(desk: Desk, tmp_path: Path) -> None:
     def keep(sweep: Sweep) -> None:
         write_table(tmp_path / "kept.csv", sweep)
 
-    sweep = run_session(
-        desk.ingest.get, CAMERAS, INDEX, STEPS.tolist(), frames=10, seconds=0.2, clock=desk.clock,
-        ask=ask, notify=lines.append, progress=lambda share: None, keep=keep,
-    )  # fmt: skip
+    session = Session(desk.ingest.get, Person(lines.append, ask), desk.clock)
+    sweep = guide(session, lambda: Meter(CAMERAS, INDEX, 10, 0.2), STEPS.tolist(), keep)
+    assert share_of(lines[-1:]) == 1.0
+    assert share_of(lines[:1]) == 1 / 8
     assert sweep.distance_m.tolist() == [1.0, 0.8, 0.55, 0.5, 0.4, 0.3, 0.25, 0.2]
     assert sweep.disparity_px == pytest.approx(RIG.disparity(sweep.distance_m), abs=0.1)
     assert (sweep.frames >= 10).all()
@@ -213,14 +215,11 @@ def test_a_whole_session_over_the_wire(desk: Desk, tmp_path: Path) -> None:
 
 def test_skipping_and_ending(desk: Desk) -> None:
     answers = deque(["s", "", "q"])
-    sweep = run_session(
-        desk.ingest.get, CAMERAS, INDEX, [0.7, 1.0, 0.5, 0.4], frames=10, seconds=0.2, clock=desk.clock,
-        ask=lambda prompt: answers.popleft(), notify=lambda line: None, progress=lambda share: None,
-        keep=lambda sweep: None,
-    )  # fmt: skip
-    assert sweep.distance_m.tolist() == [1.0]
-    empty = run_session(
-        desk.ingest.get, CAMERAS, INDEX, [1.0], frames=10, seconds=0.2, clock=desk.clock,
-        ask=lambda prompt: None, notify=lambda line: None, progress=lambda share: None, keep=lambda sweep: None,
-    )  # fmt: skip
-    assert empty.size == 0
+    person = Person(lambda line: None, lambda prompt: answers.popleft() if answers else None)
+    session = Session(desk.ingest.get, person, desk.clock)
+
+    def led(distances: list[float]) -> Sweep:
+        return guide(session, lambda: Meter(CAMERAS, INDEX, 10, 0.2), distances, lambda sweep: None)
+
+    assert led([0.7, 1.0, 0.5, 0.4]).distance_m.tolist() == [1.0]
+    assert led([1.0]).size == 0

@@ -26,8 +26,8 @@ def seen(distance: Float) -> Sweep:
     """A card of 75 x 50 mm half way between the cameras."""
     x = RIG.disparity(distance)
     v = np.full_like(x, 239.5)
-    uv = np.stack([np.stack([319.5 + 0.5 * x, v], axis=-1), np.stack([319.5 - 0.5 * x, v], axis=-1)])
-    area = np.broadcast_to(497.0**2 * 0.075 * 0.05 / distance**2, (2, distance.size)).copy()
+    uv = np.stack([np.stack([319.5 + side * x, v], axis=-1) for side in (0.5, -0.5)], axis=1)
+    area = np.repeat(497.0**2 * 0.075 * 0.05 / distance[:, None] ** 2, 2, axis=1)
     return replace(table(distance), uv=uv, area_px2=area)
 
 
@@ -74,15 +74,15 @@ def disagreeing() -> Sweep:
 
 def not_in_right() -> Sweep:
     sweep = seen(STEPS)
-    sweep.uv[1, 16] = np.nan
-    return replace(sweep, disparity_px=sweep.uv[0, :, 0] - sweep.uv[1, :, 0])
+    sweep.uv[16, 1] = np.nan
+    return replace(sweep, disparity_px=sweep.uv[:, 0, 0] - sweep.uv[:, 1, 0])
 
 
 def cut_by_the_border() -> Sweep:
     sweep = seen(STEPS)
-    sweep.uv[1, 16, 0] = 70.0  # half of the card is 93 px
-    sweep.area_px2[1, 16] *= 0.75
-    return replace(sweep, disparity_px=sweep.uv[0, :, 0] - sweep.uv[1, :, 0])
+    sweep.uv[16, 1, 0] = 70.0  # half of the card is 93 px
+    sweep.area_px2[16, 1] *= 0.75
+    return replace(sweep, disparity_px=sweep.uv[:, 0, 0] - sweep.uv[:, 1, 0])
 
 
 @pytest.mark.parametrize(
@@ -114,7 +114,7 @@ def test_what_is_unfit_is_refused_with_its_name(sweep: Sweep, words: list[str]) 
 
 def test_a_target_near_the_border_but_whole_passes() -> None:
     sweep = cut_by_the_border()
-    sweep.area_px2[1, 16] /= 0.75
+    sweep.area_px2[16, 1] /= 0.75
     assert checked(sweep, CAMERAS, SIZE).size == 17
 
 

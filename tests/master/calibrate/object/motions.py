@@ -9,7 +9,7 @@ from common.calibration import CameraCalibration, RigCalibration, load
 from common.calibration.object_profile import Bead, ObjectProfile
 from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections
-from master.calibrate.object.bundle import Seen, seen_by
+from master.calibrate.observations import Observations, points_of_detections
 
 CALIB = Path(__file__).resolve().parents[4] / "calib_json"
 RIG = load(CALIB / "rigs" / "desk-wand.json", RigCalibration)
@@ -38,6 +38,6 @@ def messages(seed: int, seconds: float = 5.0, rotation_rad_s: float = 2.0) -> li
     return [message for message in sent if isinstance(message, MarkerDetections)]
 
 
-def seen(seed: int, seconds: float = 5.0, rotation_rad_s: float = 2.0) -> Seen:
+def seen(seed: int, seconds: float = 5.0, rotation_rad_s: float = 2.0) -> Observations:
     """The same, placed."""
-    return seen_by(RIG, MODELS, RATES, messages(seed, seconds, rotation_rad_s), BEADS)
+    return points_of_detections(RIG, MODELS, RATES, messages(seed, seconds, rotation_rad_s), BEADS)

@@ -8,8 +8,15 @@ import pytest
 from common.arrays import Float
 from common.errors import CalibrationError, FitError
 from common.geometry.transforms import fit_rigid, rigid, rotation_vector_to_matrix, transform
-from master.calibrate.object.bundle import Seen, fit_bundle, rows_of, seen_in
-from master.calibrate.object.measure import Measurement, changes, frame_of, measure_object, own_frame
+from master.calibrate.object.beads import (
+    Measurement,
+    changes,
+    fit_bundle,
+    frame_of,
+    measure_object,
+    own_frame,
+)
+from master.calibrate.observations import Observations, points_of_poses, rows_of
 from tests.master.calibrate.object.motions import BEADS, PLACES_M, RIG, body, seen
 
 
@@ -20,7 +27,7 @@ def off_mm(found: Measurement) -> Float:
 
 
 @pytest.fixture(scope="module")
-def motion() -> Seen:
+def motion() -> Observations:
     """One motion of five seconds."""
     return seen(1)
 
@@ -32,12 +39,12 @@ def test_beads_are_found_within_three_tenths_of_a_millimetre_and_say_how_sure() 
     assert (off < 5.0 * 1e3 * found.sigma_m).all()
 
 
-def test_beads_that_are_seen_wrongly_for_a_while_cost_themselves(motion: Seen) -> None:
+def test_beads_that_are_seen_wrongly_for_a_while_cost_themselves(motion: Observations) -> None:
     rng = np.random.default_rng(4)
-    points = motion.points_m.copy()
+    points = motion.value.copy()
     wrong = rng.choice(len(points), len(points) // 8, replace=False)
     points[wrong, 1] += np.array([0.03, -0.02, 0.01])
-    found = measure_object(replace(motion, points_m=points))
+    found = measure_object(replace(motion, value=points))
     assert off_mm(found).max() < 0.3
     assert found.outlier_share[1] == pytest.approx(0.125, abs=0.02)
     assert found.outlier_share[[0, 2]].max() < 0.02
@@ -53,7 +60,7 @@ def test_four_beads_of_which_one_is_missing_most_of_the_time() -> None:
     lost = np.arange(200) % 5
     points[np.flatnonzero(lost < 4), lost[lost < 4]] = np.nan
     cov = np.where(np.isnan(points)[..., None], np.nan, 9e-8 * np.eye(3))
-    bundle = fit_bundle(Seen(("a", "b", "c", "d"), np.arange(200) / 60.0, points, cov))
+    bundle = fit_bundle(Observations.of("abcd", "rig", range(200), points, cov))
     off = transform(fit_rigid(places, bundle.beads_m), bundle.beads_m) - places
     assert np.linalg.norm(off, axis=1).max() < 1.5e-4
     # Chi square of what is left is one for each number that is free.
@@ -61,18 +68,18 @@ def test_four_beads_of_which_one_is_missing_most_of_the_time() -> None:
 
 
 @pytest.mark.parametrize(("bead", "by_mm"), [(0, 5.0), (2, 4.0)])
-def test_a_bead_that_is_bent_aside_half_way_is_named(motion: Seen, bead: int, by_mm: float) -> None:
+def test_a_bead_that_is_bent_aside_half_way_is_named(motion: Observations, bead: int, by_mm: float) -> None:
     bundle = fit_bundle(motion)
     way = bundle.beads_m[bead] / np.linalg.norm(bundle.beads_m[bead])
-    points = motion.points_m.copy()
+    points = motion.value.copy()
     whole = np.flatnonzero(motion.known.sum(axis=1) >= 3)
     later = whole > len(points) // 2
     points[whole[later], bead] += 1e-3 * by_mm * (bundle.T[later, :3, :3] @ way)
     with pytest.raises(FitError, match=f"not rigid.*{BEADS[bead]} moved"):
-        measure_object(replace(motion, points_m=points))
+        measure_object(replace(motion, value=points))
 
 
-def test_distances_of_what_is_rigid_stay_far_below_what_is_refused(motion: Seen) -> None:
+def test_distances_of_what_is_rigid_stay_far_below_what_is_refused(motion: Observations) -> None:
     assert max(by / most for by, most in changes(motion).values()) < 0.5
 
 
@@ -82,16 +89,16 @@ def test_beads_in_one_line_are_refused() -> None:
         own_frame(line, BEADS)
 
 
-def test_a_bead_that_one_camera_sees_is_named(motion: Seen) -> None:
-    points = motion.points_m.copy()
+def test_a_bead_that_one_camera_sees_is_named(motion: Observations) -> None:
+    points = motion.value.copy()
     points[20:, 2] = np.nan
     with pytest.raises(FitError, match=r"at 20 of \d+ epochs.*wand3 7 %"):
-        measure_object(replace(motion, points_m=points))
+        measure_object(replace(motion, value=points))
 
 
 def test_an_object_that_is_not_turned_is_refused() -> None:
     still = seen(7, 2.0, 1e-3)
-    at_rest = replace(still, points_m=np.repeat(still.points_m[:1], len(still.t_s), axis=0))
+    at_rest = replace(still, value=np.repeat(still.value[:1], len(still.t_s), axis=0))
     with pytest.raises(FitError, match="1 ways of turning and places"):
         measure_object(at_rest)
 
@@ -105,7 +112,7 @@ def test_markers_that_the_rig_does_not_have_are_refused_with_what_to_write() -> 
 
 def test_no_pose_is_nothing_seen() -> None:
     with pytest.raises(FitError, match="no bead is seen"):
-        measure_object(seen_in((), RIG, BEADS))
+        measure_object(points_of_poses((), RIG, BEADS))
 
 
 def test_own_frame_is_as_documented() -> None:

@@ -1,5 +1,6 @@
 """`calibrate object` from rendered frames to a file that tracks, what it refuses, and the motion with a person."""
 
+import dataclasses
 import json
 import sys
 from collections.abc import Callable
@@ -18,7 +19,9 @@ from common.messages import HandPose
 from common.sim.record import record_scene
 from common.sim.scenes import scene_by_name
 from master.__main__ import main
-from master.calibrate.object.command import guide, progress
+from master.calibrate.object.beads import progress_of
+from master.calibrate.object.command import guide
+from master.calibrate.session import Person, Session
 from master.objects.line import ObjectLine
 from master.replay.recorded import recorded_detections
 from master.rig.setup import load_setup
@@ -162,27 +165,27 @@ class SetClock(Clock):
 def test_a_person_is_warned_that_nothing_comes() -> None:
     output: list[str] = []
     with pytest.raises(Exception, match="no pose came"):
-        guide(lambda wait_s: None, RIG, BEADS, SetClock(), output.append, 3.0)
+        guide(Session(lambda wait_s: None, Person(output.append), SetClock()), RIG, BEADS, 3.0)
     assert any("phalanx run" in line for line in output[1:])
 
 
 def test_progress_counts_ways_of_turning_and_names_what_is_not_seen() -> None:
     motion = seen(5, 4.5)
-    line, enough = progress(motion)
-    assert enough
-    assert "done" in line
-    hidden = motion.points_m.copy()
+    found = progress_of(motion)
+    assert found.enough
+    assert found.line().startswith("100 %")
+    assert found.line().endswith("done")
+    hidden = motion.value.copy()
     hidden[-60:, 1] = np.nan
-    line, enough = progress(type(motion)(motion.names, motion.t_s, hidden, motion.cov_m2))
-    assert "not seen by two cameras: wand2" in line
+    assert "not seen by two cameras: wand2" in progress_of(dataclasses.replace(motion, value=hidden)).line()
 
 
 def test_markers_of_poses_are_what_is_measured() -> None:
     """A session of poses as a master publishes them is what was placed from the detections."""
     motion = seen(5, 1.5)
-    poses = iter([*map(_pose, range(len(motion.t_s)), motion.t_s, motion.points_m, motion.cov_m2)])
-    found = guide(lambda wait_s: next(poses, None), RIG, BEADS, SetClock(), lambda line: None, 4.0)
-    np.testing.assert_array_equal(found.points_m, motion.points_m)
+    poses = iter([*map(_pose, range(len(motion.t_s)), motion.t_s, motion.value, motion.cov)])
+    session = Session(lambda wait_s: next(poses, None), Person(lambda line: None), SetClock())
+    np.testing.assert_array_equal(guide(session, RIG, BEADS, 4.0).value, motion.value)
 
 
 def _pose(number: int, t_s: float, points: np.ndarray, cov: np.ndarray) -> HandPose:

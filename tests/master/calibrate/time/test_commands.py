@@ -102,7 +102,10 @@ def test_the_rig_file_gets_the_offset_with_its_source_and_keeps_the_rest(tmp_pat
     before = rig_file(frame_sync="predict", stamp_offset_us={"right": 3.0})
     save(out / "rigs" / "bench.json", before)
     numbers = tmp_path / "time.json"
-    code, text = run(tmp_path / "swing", "--detections", found, "--out", out, "--json", numbers)
+    picture = tmp_path / "time.png"
+    code, text = run(
+        tmp_path / "swing", "--detections", found, "--out", out, "--json", numbers, "--picture", picture
+    )
     assert code == 0, text
     assert "reference" in text
     assert "wrote" in text
@@ -113,6 +116,7 @@ def test_the_rig_file_gets_the_offset_with_its_source_and_keeps_the_rest(tmp_pat
     assert 0.0 < source.residual["right_sigma_us"] < 500.0
     assert msgspec.structs.replace(rig, stamp_offset_us=before.stamp_offset_us, provenance={}) == before
     assert msgspec.json.decode(numbers.read_bytes())["offset_us"]["right"] == rig.stamp_offset_us["right"]
+    assert picture.read_bytes().startswith(b"\x89PNG")
 
 
 def test_without_out_nothing_is_written(tmp_path: Path) -> None:
@@ -131,6 +135,13 @@ def test_unrelated_frames_and_other_cameras_are_refused(tmp_path: Path) -> None:
     assert code != 0
     assert "unrelated poses" in text
     found = write_recording(tmp_path / "swing", messages)
+    (tmp_path / "three" / "rigs").mkdir(parents=True)
+    save(tmp_path / "three" / "rigs" / "bench.json", rig_file(("left", "right", "top")))
+    rig = ("--rig", "bench", "--calibration", tmp_path / "three")
+    code, text = run(tmp_path / "swing", "--detections", found, *rig)
+    assert code != 0
+    assert "no camera 'top', which rig" in text
+    assert "it has left, right: record all cameras of the rig" in text
     out = tmp_path / "calib"
     (out / "rigs").mkdir(parents=True)
     save(out / "rigs" / "bench.json", rig_file(("right", "left")))

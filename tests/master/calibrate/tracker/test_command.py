@@ -17,8 +17,9 @@ from common.errors import FitError, RecordingError
 from common.messages import ObjectPose, ObjectSource, TrackerPose
 from common.recording.recorded_files import write_npz
 from master.__main__ import main
-from master.calibrate.tracker.command import guide, read_motion, write_motion
-from master.calibrate.tracker.tracks import coverage_of, object_track, tracker_track
+from master.calibrate.session import Person, Session
+from master.calibrate.tracker.registration import read_motion, write_motion
+from master.calibrate.tracker.tracks import coverage_of, guide, object_track, tracker_track
 from master.objects.tracker import TrackerLine
 from master.outputs.bus import publishing_devices
 from tests.master.calibrate.tracker.simulated import ZERO_NS, Motion
@@ -209,7 +210,8 @@ def played(
 def test_the_guided_motion_ends_by_itself_and_says_what_is_missing_until_then() -> None:
     motion, clock, output = Motion(9, seconds=40.0), SetClock(), list[str]()
     held = replace(motion.objects()[0], tracked=False, source=ObjectSource.HELD)
-    session = guide(played([held, *motion.objects(), *motion.tracked()], clock), clock, output.append, 60.0)
+    receive = played([held, *motion.objects(), *motion.tracked()], clock)
+    session = guide(Session(receive, Person(output.append), clock), 60.0)
     assert 15.0 < 1e-9 * (clock.t_ns - ZERO_NS) < 30.0
     assert "as well" in " ".join(output[1:4])
     assert output[-1].startswith("100 %")
@@ -233,7 +235,7 @@ def test_who_is_silent_is_said(rejected: str, text: str) -> None:
     messages: list[ObjectPose | TrackerPose] = [] if rejected in ("object", "both") else [*motion.objects()]
     messages += {"tracker": [], "both": [], "place": nowhere}.get(rejected, motion.tracked())
     try:
-        guide(played(messages, clock), clock, output.append, 7.0)
+        guide(Session(played(messages, clock), Person(output.append), clock), 7.0)
     except FitError as error:
         output.append(str(error))
     assert any(text in line for line in output)

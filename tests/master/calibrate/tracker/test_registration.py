@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from common.arrays import Float
 from common.errors import FitError
 from common.geometry.transforms import rigid, rotation_vector_to_matrix
 from common.messages import ObjectSource
-from master.calibrate.tracker.fit import Placed, closed_form, first_lag
+from master.calibrate.tracker.fit import Placed, closed_form
 from master.calibrate.tracker.registration import register
-from master.calibrate.tracker.tracks import object_track, tracker_track
-from tests.master.calibrate.tracker.simulated import ZERO_NS, Motion, errors_of
+from master.calibrate.tracker.tracks import first_lag, object_track, tracker_track
+from tests.master.calibrate.tracker.simulated import MIDDLE, ZERO_NS, Motion, errors_of
 
 
 def test_without_noise_it_is_exact() -> None:
@@ -97,6 +98,28 @@ def test_what_was_held_or_given_by_a_tracker_does_not_count() -> None:
 def test_what_does_not_determine_it_is_refused_with_what_to_do(motion: Motion, text: str) -> None:
     with pytest.raises(FitError, match=text):
         register(motion.objects(), motion.tracked())
+
+
+class Line(Motion):
+    """Carried to and fro along one line, and never turned."""
+
+    def truth(self, t_s: Float) -> tuple[Float, Float]:
+        rotation, place = super().truth(t_s)
+        return np.broadcast_to(rotation[0], rotation.shape), MIDDLE + (place - MIDDLE) * [1.0, 0.0, 0.0]
+
+
+def test_a_motion_along_one_line_is_refused_with_what_to_do() -> None:
+    line = Line(1)
+    with pytest.raises(FitError, match="about its x and its y and its z axis as well"):
+        register(line.objects(), line.tracked())
+
+
+def test_numbers_that_are_none_count_as_not_seen() -> None:
+    motion = Motion(4, seconds=10.0)
+    hole = [replace(one, position_m=np.full(3, np.nan)) for one in motion.tracked()[200:300]]
+    tracked = [*motion.tracked()[:200], *hole, *motion.tracked()[300:]]
+    placed = register(motion.objects(), tracked).fit.placed
+    assert errors_of(motion, placed)[0] < 2.0
 
 
 def test_a_tracker_that_slipped_meanwhile_is_refused() -> None:
