@@ -115,24 +115,62 @@ def report(rows: list[ColourRow]) -> str:
 
 
 def grow(hsv: Image, name: str, click: tuple[float, float]) -> Bool:
-    """Region (H, W) of the hue at a click; FitError: outside, pale, or too small."""
+    """Region (H, W) of the hue at a click; FitError: outside, no paint, or too small."""
     u, v = round(click[0]), round(click[1])
     height, width = hsv.shape[:2]
     if not (0 <= u < width and 0 <= v < height):
         raise FitError(f"clicks.{name}: ({u}, {v}) is outside the {width}x{height} image")
-    clicked = hsv[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2].reshape(-1, 3)
-    saturation = np.median(clicked[:, 1])
-    if saturation < PALE:
-        raise FitError(f"clicks.{name}: ({u}, {v}) is not on a paint: saturation {saturation:.0f} of 255")
-    near = like(hsv, circular_median(clicked[:, 0]), clicked)
-    _, labels = cv2.connectedComponents(near.astype(np.uint8), connectivity=4)
-    label = labels[v, u]
-    mask = labels == label
-    if label == 0 or int(mask.sum()) < SMALLEST:
+    _refuse_no_paint(f"clicks.{name}: ({u}, {v})", _around(hsv, click))
+    mask = _region(hsv, click)
+    if mask is None:
         raise FitError(
             f"clicks.{name}: ({u}, {v}) is on a spot of fewer than {SMALLEST} pixels of one colour"
         )
     return mask
+
+
+def _region(hsv: Image, uv: tuple[float, float]) -> Bool | None:
+    """Region (H, W) of the hue at (u, v); None: of fewer than `SMALLEST` pixels."""
+    clicked = _around(hsv, uv)
+    near = like(hsv, circular_median(clicked[:, 0]), clicked)
+    _, labels = cv2.connectedComponents(near.astype(np.uint8), connectivity=4)
+    label = labels[round(uv[1]), round(uv[0])]
+    mask = labels == label
+    return None if label == 0 or int(mask.sum()) < SMALLEST else mask
+
+
+def _around(hsv: Image, uv: tuple[float, float]) -> Image:
+    """Pixels (N, 3) at (u, v) and beside it."""
+    u, v = round(uv[0]), round(uv[1])
+    return hsv[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2].reshape(-1, 3)
+
+
+def _refuse_no_paint(where: str, pixels: Image) -> None:
+    """Refuse pixels (N, 3) that no marker colour can have.
+
+    `where` begins the message. Grey, white and near black have no hue. Skin is refused by hue alone, however
+    saturated: a red or orange paint that shines, or lies in shadow, has the colours of skin.
+
+    Raises:
+        FitError: With what to do.
+    """
+    saturation, value = np.median(pixels[:, 1]), np.median(pixels[:, 2])
+    if saturation < PALE or value < VALUE_LEAST:
+        raise FitError(
+            f"{where} is not on a paint: saturation {saturation:.0f} of 255, brightness {value:.0f}: click on the"
+            " paint; if it looks so grey, dark or white, set exposure and white balance first"
+        )
+    if _like_skin(circular_median(pixels[:, 0])):
+        raise FitError(
+            f"{where} is skin, or looks like it: click on the paint; paints that are red, orange or yellow cannot be"
+            " distinguished from skin, so take another colour"
+        )
+
+
+def _like_skin(hue: Float | Image | float) -> Bool:
+    """Which hues are those of skin, on both sides of 0."""
+    first, last = SKIN.hsv_low[0], SKIN.hsv_high[0]
+    return np.asarray((np.asarray(hue, np.float64) - first) % HUES <= (last - first) % HUES)
 
 
 def hsv_of(image: Image) -> Image:
@@ -278,25 +316,14 @@ def colour_region(hsv: Image, marker: str, uv: tuple[float, float]) -> Bool:
         raise FitError(f"{where} is outside the {width}x{height} image")
     spot = _core(hsv, uv)
     if spot is None:
-        u, v = round(uv[0]), round(uv[1])
-        around = hsv[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2].reshape(-1, 3)
-        if in_range(np.asarray(np.median(around, axis=0).round(), np.uint8), SKIN):
-            raise FitError(
-                f"{where} is skin, or looks like it: click on the paint; paints that are red, orange or yellow cannot "
-                "be distinguished from skin, so take another colour"
-            )
-        raise FitError(
-            f"{where} is not on a paint: saturation {np.median(around[:, 1]):.0f} of 255, brightness "
-            f"{np.median(around[:, 2]):.0f}: click on the paint; if it looks so grey, dark or white, set exposure and "
-            "white balance first"
-        )
-    try:
-        mask = grow(hsv, marker, spot)
-    except FitError as error:
+        _refuse_no_paint(where, _around(hsv, uv))
+    mask = None if spot is None else _region(hsv, spot)
+    if mask is None:
         raise FitError(
             f"{where} is on a spot of fewer than {SMALLEST} pixels of one colour: bring the marker nearer, and click "
             "on its middle"
-        ) from error
+        )
+    _refuse_no_paint(where, hsv[mask])
     hues = hsv[..., 0][mask]
     largest_share = 0.1  # of the image; a larger patch is no marker
     if (share := float(mask.mean())) > largest_share:
@@ -320,7 +347,7 @@ def _core(hsv: Image, uv: tuple[float, float]) -> tuple[float, float] | None:
     reach = int(near + 8)
     u0, v0 = max(round(uv[0]) - reach, 0), max(round(uv[1]) - reach, 0)
     window = hsv[v0 : round(uv[1]) + reach + 1, u0 : round(uv[0]) + reach + 1]
-    coloured = (window[..., 1] >= PALE) & (window[..., 2] >= VALUE_LEAST) & ~in_range(window, SKIN)
+    coloured = (window[..., 1] >= PALE) & (window[..., 2] >= VALUE_LEAST) & ~_like_skin(window[..., 0])
     # no single pixels
     inside = np.asarray(cv2.erode(coloured.astype(np.uint8), np.ones((2, 2), np.uint8))) != 0
     v, u = np.indices(coloured.shape)

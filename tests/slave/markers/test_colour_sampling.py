@@ -129,6 +129,68 @@ def test_a_click_that_makes_no_colour_says_what_to_do(
         SampledColours().sample(image, SAME, marker, uv, picked(PICTURE, "index"))
 
 
+def patch(hsv: tuple[int, int, int], *, on_skin: bool) -> Image:
+    """A disc of paint of 24 px at (120, 100), on a desk or on a hand."""
+    hand = [painted.Disc(painted.SKIN, 120.0, 100.0, 34.0)] if on_skin else []
+    return painted.render([*hand, painted.Disc(hsv, 120.0, 100.0, 12.0)], 240, 200, noise=2.0)
+
+
+NO_PAINT, LIKE_SKIN = (
+    r"is not on a paint: saturation \d+ of 255, brightness",
+    r"is skin, or looks like it.*red, orange",
+)
+
+
+@pytest.mark.parametrize("on_skin", [False, True])
+@pytest.mark.parametrize(
+    ("hsv", "expected"),
+    [
+        ((110, 204, 8), NO_PAINT),  # near black: the hue is noise
+        ((110, 204, 20), NO_PAINT),
+        ((60, 120, 12), NO_PAINT),
+        ((175, 230, 150), LIKE_SKIN),  # red, on both sides of the wrap
+        ((179, 230, 150), LIKE_SKIN),
+        ((0, 230, 200), LIKE_SKIN),
+        ((4, 230, 90), LIKE_SKIN),
+        ((0, 150, 200), LIKE_SKIN),
+        ((12, 200, 200), LIKE_SKIN),  # orange
+        ((15, 240, 230), LIKE_SKIN),
+        ((20, 230, 220), LIKE_SKIN),  # warm yellow
+        ((12, 120, 60), LIKE_SKIN),  # dark skin
+    ],
+)
+def test_black_red_and_orange_are_refused_by_both_kinds_of_click(
+    hsv: tuple[int, int, int], expected: str, on_skin: bool
+) -> None:
+    image, at = patch(hsv, on_skin=on_skin), (120.0, 100.0)
+    with pytest.raises(FitError, match=r"clicks.index: \(120, 100\) " + expected):
+        calibrate(image, {"index": at})
+    with pytest.raises(FitError, match=r"pick index: \(120, 100\) " + expected):
+        SampledColours().sample(image, SAME, "index", at, {})
+
+
+@pytest.mark.parametrize("on_skin", [False, True])
+@pytest.mark.parametrize("hsv", [(27, 230, 220), (172, 220, 160), (110, 204, 40)])
+def test_yellow_magenta_and_dark_blue_make_a_range_that_holds_them(
+    hsv: tuple[int, int, int], on_skin: bool
+) -> None:
+    image, at = patch(hsv, on_skin=on_skin), (120.0, 100.0)
+    [clicked] = calibrate(image, {"index": at})
+    _, picked_one = SampledColours().sample(image, SAME, "index", at, {})
+    for row in (clicked, picked_one):
+        assert row.own > 0.95
+        assert row.skin < 0.01
+        span = (row.range.hsv_high[0] - row.range.hsv_low[0]) % 180
+        assert (hsv[0] - row.range.hsv_low[0]) % 180 <= span < 30
+
+
+def test_a_click_on_skin_in_shadow_beside_a_marker_is_meant_for_the_marker() -> None:
+    shade = painted.Disc((12, 140, 66), 120.0, 100.0, 40.0)
+    image = painted.render([shade, painted.Disc((66, 200, 150), 130.0, 100.0, 9.0)], 640, 200, noise=1.0)
+    _, row = SampledColours().sample(image, SAME, "index", (114.0, 100.0), {})
+    assert row.range.hsv_low[0] <= 66 <= row.range.hsv_high[0]
+
+
 def test_a_range_of_the_file_gives_up_the_hues_that_a_picked_one_needs() -> None:
     wide = HsvRange(hsv_low=(HUE[1] - 20, 70, 50), hsv_high=(HUE[1] + 20, 255, 255))
     got = picked(PICTURE, "thumb", ranges={"index": wide, "little": painted.RANGES["little"]})

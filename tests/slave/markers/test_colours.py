@@ -39,8 +39,8 @@ def test_ranges_do_not_overlap_and_are_as_broad_as_the_neighbours_allow() -> Non
 
 
 def test_a_hue_at_the_wrap_gives_a_range_that_wraps() -> None:
-    image = render([Disc((178, 200, 150), 60.0, 50.0, 10.0)], 120, 100)
-    (row,) = calibrate(image, {"red": (60.0, 50.0)})
+    image = render([Disc((172, 200, 150), 60.0, 50.0, 10.0)], 120, 100)
+    (row,) = calibrate(image, {"magenta": (60.0, 50.0)})
     assert row.range.hsv_low[0] > row.range.hsv_high[0]
     assert row.own == 1.0
 
