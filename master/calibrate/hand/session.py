@@ -4,7 +4,7 @@ Steps are announced one by one on a running master, and a step whose markers wer
 was seen before is dropped and its time taken out, so that the rest is one routine.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,20 +12,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.arrays import Float, Int
-from common.clock import Clock, SystemClock
-from common.command_line import echo
-from common.errors import CalibrationError, FitError
+from common.errors import FitError
 from common.hand.model import HandModel
 from common.hand.routine import MOVES, STEPS, Step
 from common.messages import HandPose
 from master.calibrate.hand.measure import CERTAIN, WITHIN_M, HandMeasurement
 from master.calibrate.hand.observed import Observed, marker_rows
-from master.run.process import join_bus
+from master.calibrate.observations import check_markers
+from master.calibrate.session import Session, listening
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-Receive = Callable[[float], HandPose | None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,33 +49,28 @@ class Track:
         return np.array(self.t_ns, np.int64), np.array(self.points_m), np.array(self.cov_m2)
 
 
-def guide(
-    receive: Receive, tips: Sequence[int], names: Sequence[str], clock: Clock, notify: Callable[[str], None]
-) -> Track:
-    """Lead a person through the routine.
-
-    `receive` gives the next pose of the running master, waiting at most so long [s]; `tips` are rows of the
-    five tips among the markers; `notify` is called with one line at a time.
+def guide(session: Session[HandPose], tips: Sequence[int], names: Sequence[str]) -> Track:
+    """Lead a person through the routine; `tips` are the five tips' rows.
 
     Raises:
         FitError: No pose comes, or a step was not seen three times.
     """
-    track = Track()
+    track, notify = Track(), session.person.notify
     notify("lay the back of the hand on the table, palm to the cameras; it stays there until the end")
     for count in range(3, 0, -1):
         notify(f"{count} ...")
-        _during(receive, clock, 1.0)
+        _during(session, 1.0)
     for number, step in enumerate(STEPS):
         tries = 3
         for _ in range(tries):
             notify(f"{number + 1} of {len(STEPS)}: {step.instruction} ({step.seconds:.0f} s)")
-            poses = _during(receive, clock, step.seconds + 0.4)  # users begin after they have read
+            poses = _during(session, step.seconds + 0.4)  # users begin after they have read
             lacking = unseen(step, number, poses, tips, names)
             if not lacking:
                 track.keep(poses)
                 break
             notify(f"{lacking}; back to the flat hand, and this step again")
-            _during(receive, clock, 1.0)
+            _during(session, 1.0)
         else:
             raise FitError(
                 f"{step.name}: not seen in {tries} tries; turn the hand or a camera, and begin again"
@@ -100,14 +92,8 @@ def unseen(
     return f"{step.name}: markers are seen too little: {', '.join(poor)}" if poor else ""
 
 
-def _during(receive: Receive, clock: Clock, seconds: float) -> list[HandPose]:
-    until = clock.now_ns() + round(1e9 * seconds)
-    poses: list[HandPose] = []
-    while clock.now_ns() < until:
-        pose = receive(0.05)
-        if pose is not None:
-            poses.append(pose)
-    return poses
+def _during(session: Session[HandPose], seconds: float) -> list[HandPose]:
+    return [pose for pose in session.during(seconds) if pose is not None]
 
 
 def observe_live(bus: str, names: tuple[str, ...], model: HandModel) -> Observed:
@@ -119,24 +105,15 @@ def observe_live(bus: str, names: tuple[str, ...], model: HandModel) -> Observed
         FitError: The routine was not seen.
     """
     tips = marker_rows(names, model)[:5]
-    link = join_bus(bus)
-    try:
-        poses = link.subscribe("hand", depth=256)  # poses that may wait while a line is printed
 
-        def receive(timeout_s: float) -> HandPose | None:
-            message = poses.get(timeout_s)
-            if message is None or not isinstance(message, HandPose):
-                return None
-            if len(message.markers_raw_m) != len(names):
-                raise CalibrationError(
-                    f"the running master has {len(message.markers_raw_m)} markers, the rig {len(names)}: name its"
-                    " rig with --rig"
-                )
-            return message
+    def wanted(message: object) -> HandPose | None:
+        if not isinstance(message, HandPose):
+            return None
+        check_markers(message, names)
+        return message
 
-        track = guide(receive, tips, names, SystemClock(), echo)
-    finally:
-        link.close()
+    with listening(bus, {"hand": None}, wanted) as receive:
+        track = guide(Session(receive), tips, names)
     return Observed.of(*track.arrays(), names, model)
 
 

@@ -8,6 +8,8 @@ from common.errors import FitError
 from common.hand.routine import STEPS
 from common.messages import HandPose, Source
 from master.calibrate.hand.session import Track, guide, unseen
+from master.calibrate.session import Person as Guided
+from master.calibrate.session import Session
 
 NAMES = ("thumb", "index", "middle", "ring", "little", "back")
 TIPS = (0, 1, 2, 3, 4)
@@ -42,7 +44,7 @@ class Person(Clock):
         return pose_at(self.t_ns, self._hidden if dark else ())
 
     def guide(self) -> Track:
-        return guide(self.receive, TIPS, NAMES, self, self.output.append)
+        return guide(Session(self.receive, Guided(self.output.append), self), TIPS, NAMES)
 
 
 def test_all_steps_are_reported_in_order_and_kept() -> None:
