@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
-from common.arrays import Float, Int
+from common.arrays import Bool, Float, Int
 from common.command_line import echo
 from master.calibrate.tree_files import print_lines
 from master.commands.summary import write_summary
@@ -27,11 +28,11 @@ class Column:
         form: How a number is printed, such as "8.2f"; empty: texts.
         unit: Printed behind a number.
         key: Its key in JSON, with the unit; what follows a dot is a key of an object in there. Empty: not in JSON.
-        foot: Numbers below, in the rows of `Table.foot`.
+        foot: Numbers below, in the rows of `Table.foot`, without the sign that `form` asks for.
     """
 
     title: str
-    values: Float | Int | Sequence[object]
+    values: Float | Int | Bool | Sequence[object]
     form: str = ""
     unit: str = ""
     key: str = ""
@@ -39,14 +40,16 @@ class Column:
 
     def cells(self) -> list[str]:
         """Heading, rows and foot, equally wide."""
-        texts = [self.title, *(self._text(one) for one in [*self.values, *self.foot])]
+        below = [self._text(one, self.form.lstrip("+")) for one in self.foot]
+        texts = [self.title, *(self._text(one, self.form) for one in self.values), *below]
         width, side = max(map(len, texts)), ">" if self.form else "<"
         return [f"{text:{side}{width}s}" for text in texts]
 
-    def _text(self, value: object) -> str:
-        if not isinstance(value, int | float | np.number):
-            return str(value)
-        return "-" if np.isnan(value) else f"{value:{self.form}} {self.unit}".rstrip()
+    def _text(self, value: object, form: str) -> str:
+        number = _python(value)
+        if not isinstance(number, int | float):
+            return str(number)
+        return "-" if np.isnan(number) else f"{number:{form}} {self.unit}".rstrip()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,11 +86,14 @@ class Table:
 
 def plain(value: object) -> object:
     """A value as JSON has it: numbers of Python, null for NaN, lists for arrays."""
-    if isinstance(value, np.ndarray):
-        return [plain(one) for one in value]
-    if isinstance(value, np.generic):
-        value = value.item()
+    value = _python(value)
+    if isinstance(value, list):
+        return [plain(one) for one in cast("list[object]", value)]
     return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _python(value: object) -> object:
+    return cast(object, np.asarray(value).tolist()) if hasattr(value, "tolist") else value
 
 
 Write = Callable[[Path], Mapping[Path, str]]
@@ -118,7 +124,7 @@ def finish(
         draw(options.picture)
         echo(f"drew {options.picture}")
     if write is not None:
-        written = {} if options.out is None else write(options.out)
+        written: Mapping[Path, str] = {} if options.out is None else write(options.out)
         for path, what in written.items():
             echo(f"wrote {path}: {what}")
         if options.out is None:

@@ -6,7 +6,7 @@ place.
 """
 
 from argparse import Namespace
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -199,8 +199,8 @@ def _averaged(pairs: Pairs, runs: Sequence[Int], distance: Float) -> Sweep:
     return Sweep.joined(
         [
             place_of(
-                pairs.uv[:, run],
-                pairs.area_px2[:, run],
+                list(pairs.uv[:, run]),
+                list(pairs.area_px2[:, run]),
                 float(disparity[run].std(ddof=1) if run.size >= STILL_FRAMES else stated[run].mean()),
                 f"frame {run[0]}" if run.size == 1 else f"frames {run[0]}-{run[-1]}",
                 d,
@@ -320,51 +320,6 @@ def load_pair(
     return pair_of(rig, {name: _with_view(file, fov_deg) for name, file in files.items()}, rig_name, origin)
 
 
-def from_table(path: Path, pair: Pair, outline: Float) -> Measured:
-    """The sweep of a CSV."""
-    sweep, note = straightened(read_table(path), pair, outline)
-    return Measured(sweep, pair, path.name, f"{sweep.size} rows of {path}{note}")
-
-
-def from_recording(
-    folder: Path,
-    detections: Path | None,
-    marker: str | None,
-    distances: str | None,
-    pair_for: Callable[[FrameRecording], Pair],
-    outline: Float,
-) -> Measured:
-    """The sweep of a recording, by its detections_<camera>.npz in a folder.
-
-    Args:
-        marker: The target; None: the only one that is seen.
-        distances: FIRST:LAST:STEP, a list, or the path of a .csv; None: from truth.npz of a rendered
-            recording.
-        pair_for: The rig and cameras to use with this recording.
-        outline: Shape of the target, see `parse_target`.
-
-    Raises:
-        RecordingError, CalibrationError: Something is missing; the message states how to make it.
-    """
-    recording = open_recording(folder)
-    pair = pair_for(recording)
-    if detections is None:
-        lines = "; ".join(
-            f"phalanx-slave run --name {camera} --camera replay:{folder} -o DIR/detections_{camera}.npz"
-            for camera in pair.cameras
-        )
-        raise CalibrationError(
-            f"{folder}: --detections DIR is missing; make it with: {lines} (each with --calibration, if the recording"
-            " carries no colours)"
-        )
-    pairs, target = read_pairs(recording, detections, pair.cameras, marker)
-    sweep, summary = _placed(recording, pairs, distances)
-    sweep, note = straightened(sweep, pair, outline)
-    frames = f"{pairs.t_ns.size} frame pairs of {folder.name}"
-    about = f"{sweep.size} places of the marker {target!r} in {frames}, {summary}{note}"
-    return Measured(sweep, pair, folder.name, about)
-
-
 def parse_target(text: str) -> Float:
     """The outline of the target `round`, or `75x50` (width x height, of any unit).
 
@@ -394,42 +349,19 @@ def straightened(sweep: Sweep, pair: Pair, outline: Float) -> tuple[Sweep, str]:
     return replace(sweep, uv=uv, disparity_px=uv[:, 0, 0] - uv[:, 1, 0]), note
 
 
-def _placed(recording: FrameRecording, pairs: Pairs, distances: str | None) -> tuple[Sweep, str]:
-    """The pairs with their distances, and where these come from."""
-    if distances is None:
-        sweep = by_truth(recording, pairs)
-        if sweep is None:
-            raise CalibrationError(
-                f"{recording.folder}: --distances is missing (and there is no truth.npz with depth): give"
-                " FIRST:LAST:STEP in metres, such as 1.00:0.20:-0.05, or a .csv with the columns t_s,distance_m"
-            )
-        return sweep, "distances from its truth.npz"
-    if distances.endswith(".csv"):
-        return by_file(pairs, Path(distances)), f"distances from {distances}"
-    return by_list(pairs, parse_distances(distances)), f"distances {distances}"
-
-
 def measured_from(options: Namespace, outline: Float) -> Measured:
-    """The sweep of a recording or a table.
+    """The sweep of a recording, by its detections, or of a table.
+
+    `outline` is the target's, of `parse_target`.
 
     Raises:
         PhalanxError: What the user gave does not make one; the message states what is missing.
     """
     source: Path | None = options.source
-    rig: str | None = options.rig
     if source is None:
         raise CalibrationError("what to read is missing: give the folder of a recording, a .csv, or --live")
     if source.is_dir():
-
-        def pair_for(recording: FrameRecording) -> Pair:
-            manifest = recording.manifest
-            if rig is None:
-                return pair_of(manifest.marker_rig(), manifest.cameras)
-            return load_pair(options.calibration, rig, options.fov_deg, manifest.cameras)
-
-        return from_recording(
-            source, options.detections, options.marker, options.distances, pair_for, outline
-        )
+        return _recorded(options, source, outline)
     if source.suffix.lower() != ".csv":
         there = source.exists()
         raise CalibrationError(
@@ -438,8 +370,44 @@ def measured_from(options: Namespace, outline: Float) -> Measured:
         )
     idle = {name: vars(options)[name] for name in ("detections", "marker", "distances")}
     refuse_idle(f"{source}, a table", **idle)
-    pair = Pair() if rig is None else load_pair(options.calibration, rig, options.fov_deg)
-    return from_table(source, pair, outline)
+    pair = Pair() if options.rig is None else load_pair(options.calibration, options.rig, options.fov_deg)
+    sweep, note = straightened(read_table(source), pair, outline)
+    return Measured(sweep, pair, source.name, f"{sweep.size} rows of {source}{note}")
+
+
+def _recorded(options: Namespace, folder: Path, outline: Float) -> Measured:
+    recording = open_recording(folder)
+    cameras = recording.manifest.cameras
+    if options.rig is None:
+        pair = pair_of(recording.manifest.marker_rig(), cameras)
+    else:
+        pair = load_pair(options.calibration, options.rig, options.fov_deg, cameras)
+    if options.detections is None:
+        lines = "; ".join(
+            f"phalanx-slave run --name {camera} --camera replay:{folder} -o DIR/detections_{camera}.npz"
+            for camera in pair.cameras
+        )
+        raise CalibrationError(
+            f"{folder}: --detections DIR is missing; make it with: {lines} (each with --calibration, if the recording"
+            " carries no colours)"
+        )
+    pairs, target = read_pairs(recording, options.detections, pair.cameras, options.marker)
+    distances: str | None = options.distances
+    if distances is None:
+        sweep, given_by = by_truth(recording, pairs), "from its truth.npz"
+        if sweep is None:
+            raise CalibrationError(
+                f"{folder}: --distances is missing (and there is no truth.npz with depth): give FIRST:LAST:STEP in"
+                " metres, such as 1.00:0.20:-0.05, or a .csv with the columns t_s,distance_m"
+            )
+    elif distances.endswith(".csv"):
+        sweep, given_by = by_file(pairs, Path(distances)), f"from {distances}"
+    else:
+        sweep, given_by = by_list(pairs, parse_distances(distances)), distances
+    sweep, note = straightened(sweep, pair, outline)
+    frames = f"{pairs.t_ns.size} frame pairs of {folder.name}"
+    about = f"{sweep.size} places of the marker {target!r} in {frames}, distances {given_by}{note}"
+    return Measured(sweep, pair, folder.name, about)
 
 
 def refuse_idle(where: str, **given: object) -> None:

@@ -6,7 +6,7 @@ Both cameras of a pair see the target. Refused is what would give a law that loo
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -71,24 +71,34 @@ class Sweep:
         """The chosen places, by mask (N,) or by index (K,)."""
         index: Int = np.arange(self.size)[chosen]
         order: list[int] = index.tolist()
-        return Sweep(*(array[index] for array in self._arrays()), tuple(self.place[i] for i in order))
+        return self._each(lambda array: array[index], self.frames[index], tuple(self.place[i] for i in order))
 
     def mean(self) -> "Sweep":
         """One place: the mean of all, which stand at the same distance."""
-        distance, disparity, uv, area, sigma, frames = self._arrays()
-        means = (array.mean(axis=0, keepdims=True) for array in (distance, disparity, uv, area, sigma))
-        return Sweep(*means, frames.sum(keepdims=True), ("mean of " + ", ".join(self.place),))
+        place = ("mean of " + ", ".join(self.place),)
+        return self._each(
+            lambda array: array.mean(axis=0, keepdims=True), self.frames.sum(keepdims=True), place
+        )
+
+    def _each(self, change: Callable[[Float], Float], frames: Int, place: tuple[str, ...]) -> "Sweep":
+        arrays = (self.distance_m, self.disparity_px, self.uv, self.area_px2, self.sigma_px)
+        distance, disparity, uv, area, sigma = map(change, arrays)
+        return Sweep(distance, disparity, uv, area, sigma, frames, place)
 
     @staticmethod
     def joined(parts: Sequence["Sweep"]) -> "Sweep":
         """All places of several sweeps, in their order."""
         if not parts:
             return Sweep.of_disparity(np.empty(0), np.empty(0), ())
-        arrays = (np.concatenate(same) for same in zip(*(part._arrays() for part in parts), strict=True))
-        return Sweep(*arrays, tuple(name for part in parts for name in part.place))
-
-    def _arrays(self) -> tuple[Float, Float, Float, Float, Float, Int]:
-        return self.distance_m, self.disparity_px, self.uv, self.area_px2, self.sigma_px, self.frames
+        return Sweep(
+            np.concatenate([part.distance_m for part in parts]),
+            np.concatenate([part.disparity_px for part in parts]),
+            np.concatenate([part.uv for part in parts]),
+            np.concatenate([part.area_px2 for part in parts]),
+            np.concatenate([part.sigma_px for part in parts]),
+            np.concatenate([part.frames for part in parts]),
+            tuple(name for part in parts for name in part.place),
+        )
 
     def names(self, chosen: Bool | Int) -> str:
         """The chosen places in words: "0.45 m (line 12), 0.5 m (line 13)"."""

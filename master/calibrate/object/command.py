@@ -85,7 +85,7 @@ def object_command(options: Namespace) -> None:
         return written
 
     table = beads_table(found, profile, misses)
-    numbers = {
+    numbers: dict[str, object] = {
         "object": profile.name,
         "epochs": len(found.bundle.T),
         "looks": found.looks,

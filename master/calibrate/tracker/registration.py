@@ -249,15 +249,12 @@ def write_motion(path: Path, objects: Sequence[ObjectPose], tracked: Sequence[Tr
     """
     own = [one for one in objects if one.tracked]
     arrays = {
-        "object_t_ns": np.array([one.t_ns for one in own], np.int64),
-        "object_position_m": np.array([one.position_m for one in own]).reshape(-1, 3),
-        "object_orientation_wxyz": np.array([one.orientation_wxyz for one in own]).reshape(-1, 4),
-        "object_cov": np.array([one.cov for one in own]).reshape(-1, 6, 6),
-        "object_source": np.array([one.source for one in own], np.uint8),
-        "tracker_t_ns": np.array([one.t_ns for one in tracked], np.int64),
-        "tracker_position_m": np.array([one.position_m for one in tracked]).reshape(-1, 3),
-        "tracker_orientation_wxyz": np.array([one.orientation_wxyz for one in tracked]).reshape(-1, 4),
+        f"{who}_{key}": np.array([getattr(one, key) for one in poses]).reshape(-1, *shape)
+        for who, poses in (("object", own), ("tracker", tracked))
+        for key, shape in _KEYS.items()
     }
+    arrays["object_cov"] = np.array([one.cov for one in own]).reshape(-1, 6, 6)
+    arrays["object_source"] = np.array([one.source for one in own], np.uint8)
     try:
         write_npz(path, arrays)
     except OSError as error:

@@ -60,7 +60,7 @@ def test_four_beads_of_which_one_is_missing_most_of_the_time() -> None:
     lost = np.arange(200) % 5
     points[np.flatnonzero(lost < 4), lost[lost < 4]] = np.nan
     cov = np.where(np.isnan(points)[..., None], np.nan, 9e-8 * np.eye(3))
-    bundle = fit_bundle(Observations.of("abcd", "rig", range(200), points, cov))
+    bundle = fit_bundle(Observations.of("abcd", "rig", range(200), list(points), list(cov)))
     off = transform(fit_rigid(places, bundle.beads_m), bundle.beads_m) - places
     assert np.linalg.norm(off, axis=1).max() < 1.5e-4
     # Chi square of what is left is one for each number that is free.
