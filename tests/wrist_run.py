@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 
 from common.arrays import Float
-from common.geometry.transforms import matrix_to_quaternion
 from common.hand.model import HandModel
 from common.hand.profiles import mirrored_profile
-from common.messages import HandPose, Source, WristDetections
+from common.messages import Source, WristDetections
 from common.sim.wrist.scene import WristScene, WristTruth
 from master.outputs.poses import Poses
 from master.rig.setup import RigSetup, load_setup
 from master.rig.wrist import WristSetup
+from tests.results import pose_of
 
 CYCLE_NS = 33_333_333
 START_NS = 1_000_000_000
@@ -52,24 +52,15 @@ def exact_cycle(setup: RigSetup, now: WristTruth, k: int, t_ns: int | None = Non
 
 def true_poses(setup: RigSetup, truths: list[WristTruth]) -> Poses:
     """One pose for each instant, as an errorless master would publish it."""
-    none = np.empty((0, 3))
     return Poses.of(
         [
-            HandPose(
-                hand=setup.hand.profile.name,
+            pose_of(
+                setup.hand,
+                now.joints,
                 t_ns=START_NS + k * CYCLE_NS,
-                position_m=now.joints.position_m,
-                orientation_wxyz=matrix_to_quaternion(now.joints.rotation),
-                radius_m=setup.hand.radius_m,
-                valid=np.ones(26, np.bool_),
-                tracked=np.ones(26, np.bool_),
-                cov_m2=np.tile(1e-6 * np.eye(3), (26, 1, 1)),
                 source=np.full(26, Source.WRIST, np.uint8),
                 angles_rad=now.angles_rad,
-                markers_m=none,
-                markers_raw_m=none,
-                markers_cov_m2=np.empty((0, 3, 3)),
-                inside_volume=np.ones(26, np.bool_),
+                markers_m=np.empty((0, 3)),
                 latency_ns=8_000_000,
                 laser_m=now.laser_pt[1:6],
             )

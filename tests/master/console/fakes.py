@@ -14,10 +14,10 @@ from common.calibration import CameraCalibration, HsvRange, load, save
 from common.calibration.camera_settings import figures
 from common.clock import now_ns
 from common.errors import CalibrationError
-from common.geometry.transforms import matrix_to_quaternion
 from common.hand.model import TIPS
 from common.messages import CheckItem, Checklist, Command, Gesture, HandPose, Health, Preview, Source
 from tests.hand_helpers import RIGHT
+from tests.results import pose_of
 from tests.synthetic_run import hand_at
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -188,26 +188,18 @@ class FakeMaster:
 
 def pose(number: int) -> HandPose:
     """A hand that sways, opens and closes; its little finger is held."""
-    joints = hand_at(0.02 * number)
     source = np.full(26, Source.SOLVED, np.uint8)
     source[list(TIPS)] = Source.MEASURED
     source[22:26] = Source.HELD
-    markers = np.zeros((6, 3))
-    return HandPose(
+    return pose_of(
+        RIGHT,
+        hand_at(0.02 * number),
         hand="default-right",
         t_ns=now_ns(),
-        position_m=joints.position_m,
-        orientation_wxyz=matrix_to_quaternion(joints.rotation),
-        radius_m=RIGHT.radius_m,
-        valid=np.ones(26, np.bool_),
         tracked=source != Source.HELD,
         cov_m2=np.full((26, 3, 3), np.nan),
         source=source,
-        angles_rad=np.zeros((5, 4)),
-        markers_m=markers,
-        markers_raw_m=markers,
-        markers_cov_m2=np.zeros((6, 3, 3)),
-        inside_volume=np.ones(26, np.bool_),
+        markers_m=np.zeros((6, 3)),
         latency_ns=7_000_000 + 400_000 * (number % 9),
     )
 

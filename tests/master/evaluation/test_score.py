@@ -7,9 +7,10 @@ import pytest
 
 from common.arrays import Float
 from common.errors import RecordingError
-from common.messages import HandPose, Source
+from common.messages import Source
 from master.evaluation.score import Truth, load_truth, score, score_hidden
 from master.outputs.poses import Poses
+from tests.results import hand_pose
 
 FINGERS = (0, 1, 2, 3, 4, -1)
 ALL = np.ones(6, dtype=bool)
@@ -19,21 +20,12 @@ def poses(count: int, position: Float, angles: Float, markers: Float, start_ns: 
     """Rows 10 ms apart, all alike."""
     return Poses.of(
         [
-            HandPose(
-                hand="made",
+            hand_pose(
                 t_ns=start_ns + 10_000_000 * k,
                 position_m=position,
-                orientation_wxyz=np.tile([1.0, 0.0, 0.0, 0.0], (26, 1)),
-                radius_m=np.full(26, 0.01),
-                valid=np.ones(26, dtype=bool),
-                tracked=np.ones(26, dtype=bool),
-                cov_m2=np.zeros((26, 3, 3)),
-                source=np.full(26, 2, dtype=np.uint8),
                 angles_rad=angles,
                 markers_m=markers,
                 markers_raw_m=markers + np.array([0.0, 0.0, 1e-3]),
-                markers_cov_m2=np.zeros((len(markers), 3, 3)),
-                inside_volume=np.ones(26, dtype=bool),
             )
             for k in range(count)
         ]

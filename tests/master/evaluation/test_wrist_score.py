@@ -20,6 +20,7 @@ from master.evaluation.wrist_score import (
 )
 from master.outputs.poses import Poses
 from tests.hand_helpers import camera_file
+from tests.results import hand_pose
 
 PERIOD_NS = 33_333_333
 N = 4
@@ -42,31 +43,19 @@ def truth() -> WristTruth:
 
 def poses(exact: WristTruth) -> Poses:
     """What an errorless device makes of it."""
-    angles = np.zeros((N, 5, 4))
+    angles, none = np.zeros((N, 5, 4)), np.empty((0, 3))
     angles[:, :, 2] = exact.pip_rad
-    return Poses(
-        hand="made",
-        t_ns=exact.t_ns,
-        position_m=np.zeros((N, 26, 3)),
-        orientation_wxyz=np.tile([1.0, 0.0, 0.0, 0.0], (N, 26, 1)),
-        radius_m=np.full((N, 26), 0.01),
-        valid=np.ones((N, 26), np.bool_),
-        tracked=np.ones((N, 26), np.bool_),
-        cov_m2=np.zeros((N, 26, 3, 3)),
-        source=np.full((N, 26), 4, np.uint8),
-        angles_rad=angles,
-        markers_m=np.empty((N, 0, 3)),
-        markers_raw_m=np.empty((N, 0, 3)),
-        markers_cov_m2=np.empty((N, 0, 3, 3)),
-        inside_volume=np.ones((N, 26), np.bool_),
-        latency_ns=np.zeros(N, np.int64),
-        laser_m=exact.laser_m[:, 1:6],
-        solver_mode=np.full((N, 5), SolverMode.FK, np.uint8),
-        ambiguous=np.zeros((N, 5), np.bool_),
-        palm_world_wxyz=np.full((N, 4), np.nan),
-        palm_world_sigma_rad=np.full((N, 2), np.nan),
-        wrist_angles_rad=np.full((N, 2), np.nan),
-        wrist_angles_sigma_rad=np.full((N, 2), np.nan),
+    return Poses.of(
+        [
+            hand_pose(
+                t_ns=int(exact.t_ns[k]),
+                angles_rad=angles[k],
+                markers_m=none,
+                laser_m=exact.laser_m[k, 1:6],
+                solver_mode=np.full(5, SolverMode.FK, np.uint8),
+            )
+            for k in range(N)
+        ]
     )
 
 

@@ -3,11 +3,11 @@
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.geometry.transforms import matrix_to_quaternion
 from common.hand.model import HandModel
 from common.messages import HandPose
 from common.sim.motion import POSES, angles_of
 from tests.hand_helpers import RIGHT, palm
+from tests.results import pose_of
 
 FRAME_NS = 16_666_667
 OPEN, TWO, POINT, SMALL, LARGE, PINCH = POSES  # the paper's A to F
@@ -29,26 +29,19 @@ def shown(
     markers: int = 0,
 ) -> HandPose:
     """The hand of these angles; per finger the sigma of its joints (5,) [m] and whether it is observed (5,)."""
-    nowhere = np.full((markers, 3), np.nan)
     joints = model.forward(palm() if T_rig_palm is None else T_rig_palm, angles_rad)
     joint_sigma_m, seen = np.full(26, 1e-3), np.ones(26, np.bool_)
     for f in range(5):
         own = slice(2, 6) if f == 0 else slice(7 + 5 * (f - 1), 11 + 5 * (f - 1))
         joint_sigma_m[own] = 1e-3 if sigma_m is None else sigma_m[f]
         seen[own] = True if tracked is None else tracked[f]
-    return HandPose(
-        hand=model.profile.name,
+    return pose_of(
+        model,
+        joints,
         t_ns=t_ns,
-        position_m=joints.position_m,
-        orientation_wxyz=matrix_to_quaternion(joints.rotation),
-        radius_m=model.radius_m,
-        valid=np.ones(26, np.bool_),
         tracked=seen,
         cov_m2=joint_sigma_m[:, None, None] ** 2 * np.eye(3),
         source=np.ones(26, np.uint8),
         angles_rad=angles_rad,
-        markers_m=nowhere,
-        markers_raw_m=nowhere,
-        markers_cov_m2=np.full((markers, 3, 3), np.nan),
-        inside_volume=np.ones(26, np.bool_),
+        markers_m=np.full((markers, 3), np.nan),
     )

@@ -5,11 +5,13 @@ from pathlib import Path
 import numpy as np
 
 from common.arrays import Float, Int
-from common.geometry.transforms import matrix_to_quaternion, rotation_vector_to_matrix
+from common.geometry.transforms import rotation_vector_to_matrix
 from common.hand.model import JOINTS, HandJoints, HandModel
 from common.hand.profiles import generated_profile
-from common.messages import HandPose, Source
+from common.messages import HandPose
 from master.mocap.bvh_file import JointMotion, Side, Track
+from tests.hand_helpers import palm
+from tests.results import pose_of
 
 RIGHT = HandModel.of(generated_profile("moved-right", "right"))
 LEFT = HandModel.of(generated_profile("moved-left", "left"))
@@ -69,23 +71,13 @@ def poses_of(t_s: Float, sigma_m: float, seed: int = 1, model: HandModel = RIGHT
     hand, rng = hand_at(t_s, model), np.random.default_rng(seed)
     found = hand.position_m + rng.normal(0.0, sigma_m, hand.position_m.shape)
     markers = model.marker_points(hand, tuple(model.mounts))
-    good = np.ones(26, np.bool_)
     return [
-        HandPose(
-            hand=model.profile.name,
+        pose_of(
+            model,
+            HandJoints(found[k], hand.rotation[k], palm()),
             t_ns=int(ns(t_s)[k]),
-            position_m=found[k],
-            orientation_wxyz=matrix_to_quaternion(hand.rotation[k]),
-            radius_m=model.radius_m,
-            valid=good,
-            tracked=good,
             cov_m2=np.tile(sigma_m**2 * np.eye(3), (26, 1, 1)),
-            source=np.full(26, Source.SOLVED),
-            angles_rad=np.zeros((5, 4)),
             markers_m=markers[k],
-            markers_raw_m=markers[k],
-            markers_cov_m2=np.zeros((6, 3, 3)),
-            inside_volume=good,
         )
         for k in range(len(t_s))
     ]

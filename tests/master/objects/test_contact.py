@@ -15,6 +15,7 @@ from common.messages import JOINT_COUNT, HandPose, ObjectPose
 from common.sim.grasp import bar_in_palm, closed_round, gaps_m
 from common.sim.motion import REST, angles_of
 from master.objects.contact import ContactMonitor
+from tests.results import object_pose, pose_of
 
 HAND = HandModel.of(load(Path(__file__).parents[3] / "calib_json/hands/default-right.json", HandProfile))
 RADIUS_M = 0.012
@@ -30,40 +31,13 @@ OPEN = angles_of(HAND, np.array(REST, dtype=np.float64), STILL)
 
 def hand(angles: Float, t_ns: int = 0, sigma_m: float = 1e-3) -> HandPose:
     joints = HAND.forward(PALM, angles)
-    yes = np.ones(JOINT_COUNT, np.bool_)
-    nowhere = np.empty((0, 3))
-    return HandPose(
-        hand=HAND.profile.name,
-        t_ns=t_ns,
-        position_m=joints.position_m,
-        orientation_wxyz=matrix_to_quaternion(joints.rotation),
-        radius_m=HAND.radius_m,
-        valid=yes,
-        tracked=yes,
-        cov_m2=np.tile(sigma_m**2 * np.eye(3), (JOINT_COUNT, 1, 1)),
-        source=np.full(JOINT_COUNT, 2, np.uint8),
-        angles_rad=angles,
-        markers_m=nowhere,
-        markers_raw_m=nowhere,
-        markers_cov_m2=np.empty((0, 3, 3)),
-        inside_volume=yes,
-    )
+    cov = np.tile(sigma_m**2 * np.eye(3), (JOINT_COUNT, 1, 1))
+    return pose_of(HAND, joints, t_ns=t_ns, cov_m2=cov, angles_rad=angles)
 
 
 def bar(T: Float, t_ns: int = 0, cov: Float | None = None) -> ObjectPose:
-    return ObjectPose(
-        object="bar",
-        t_ns=t_ns,
-        position_m=T[:3, 3],
-        orientation_wxyz=matrix_to_quaternion(T[:3, :3]),
-        cov=np.zeros((6, 6)) if cov is None else cov,
-        residual_m=0.0,
-        source=1,
-        tracked=True,
-        seen=3,
-        expected=3,
-        occluded=False,
-    )
+    known = np.zeros((6, 6)) if cov is None else cov
+    return object_pose("bar", T[:3, 3], matrix_to_quaternion(T[:3, :3]), t_ns=t_ns, cov=known)
 
 
 def watch(T: Float = PALM @ IN_PALM, t_ns: int = 0) -> ContactMonitor:

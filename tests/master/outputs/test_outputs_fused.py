@@ -9,7 +9,7 @@ import pytest
 import rerun as rr
 
 from common.arrays import Float
-from common.geometry.transforms import matrix_to_quaternion, quaternion_to_matrix, transform
+from common.geometry.transforms import quaternion_to_matrix, transform
 from common.hand.model import WRIST
 from common.messages import HandPose, Source
 from common.sim.scenes import scene_by_name
@@ -22,6 +22,7 @@ from master.outputs.rerun import write_rrd
 from master.outputs.rerun_scene import RerunScene
 from master.rig.setup import RigSetup, load_setups
 from tests.master.outputs.test_outputs_rerun import column, rows_of
+from tests.results import pose_of
 
 TIMES_S = np.linspace(0.5, 9.0, 5)
 ROOT = ("/world/cameras/wrist", "/world/laser", "/world/rays/wrist")
@@ -51,21 +52,13 @@ def poses(setup: RigSetup, wrist_truths: list[WristTruth]) -> Poses:
     for k, (t, device) in enumerate(zip(TIMES_S, wrist_truths, strict=True)):
         now = scene.truth(float(t))
         out.append(
-            HandPose(
-                hand=setup.hand.profile.name,
+            pose_of(
+                setup.hand,
+                now.joints,
                 t_ns=10**9 + k * 16_666_667,
-                position_m=now.joints.position_m,
-                orientation_wxyz=matrix_to_quaternion(now.joints.rotation),
-                radius_m=setup.hand.radius_m,
-                valid=np.ones(26, np.bool_),
-                tracked=np.ones(26, np.bool_),
-                cov_m2=np.tile(1e-6 * np.eye(3), (26, 1, 1)),
                 source=source,
                 angles_rad=now.angles_rad,
                 markers_m=now.markers_m,
-                markers_raw_m=now.markers_m,
-                markers_cov_m2=np.full((6, 3, 3), np.nan),
-                inside_volume=np.ones(26, np.bool_),
                 laser_m=device.laser_pt[1:6],
                 wrist_angles_rad=now.wrist_angles_rad,
                 wrist_angles_sigma_rad=np.radians([2.0, 4.0]),

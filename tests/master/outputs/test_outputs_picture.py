@@ -10,9 +10,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from msgspec.structs import replace
 
-from common.calibration import RigCalibration, Volume
+from common.calibration import Volume
 from common.errors import RecordingError
-from common.geometry.transforms import matrix_to_quaternion, rigid
+from common.geometry.transforms import rigid
 from common.hand.model import TIPS, WRIST, HandModel
 from common.hand.profiles import generated_profile
 from common.messages import HandPose, Source
@@ -20,17 +20,11 @@ from master.outputs import picture
 from master.outputs.drawing import SOURCE_RGB, View, render_hand
 from master.outputs.picture import best_row, draw_summary, fit_view
 from master.outputs.poses import Poses, PosesTruth
+from tests.hand_helpers import rig_file
+from tests.results import pose_of
 
 MODEL = HandModel.of(generated_profile("test-hand", "right"))
-EYE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-RIG = RigCalibration(
-    version=1,
-    name="desk",
-    kind="markers",
-    cameras=("left", "right"),
-    hand="test-hand",
-    T_rig_camera={"left": EYE, "right": ((1.0, 0.0, 0.0, 0.075), *EYE[1:])},
-)
+RIG = rig_file(name="desk", hand="test-hand")
 # Palm frame in the rig frame: fingers (+z) up the image (-y), back of the hand (+y) to the camera (-z).
 UPRIGHT = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -42,21 +36,16 @@ def pose(index: int = 0, flexion: float = 0.0) -> HandPose:
     source = np.full(26, Source.SOLVED, np.uint8)
     source[TIPS] = Source.MEASURED
     markers = MODEL.marker_points(joints, RIG.markers)
-    return HandPose(
-        hand="test-hand",
+    return pose_of(
+        MODEL,
+        joints,
         t_ns=10**15 + index * 16_666_667,
-        position_m=joints.position_m,
-        orientation_wxyz=matrix_to_quaternion(joints.rotation),
-        radius_m=MODEL.radius_m,
-        valid=np.ones(26, np.bool_),
         tracked=source == Source.MEASURED,
         cov_m2=np.full((26, 3, 3), np.nan),
         source=source,
         angles_rad=angles,
         markers_m=markers,
         markers_raw_m=markers + 0.001,
-        markers_cov_m2=np.full((len(markers), 3, 3), np.nan),
-        inside_volume=np.ones(26, np.bool_),
         latency_ns=8_000_000 + index * 1000,
     )
 
@@ -210,7 +199,7 @@ def test_a_full_disk_is_a_clear_error_and_the_older_picture_stays(
 
 
 def test_the_small_view_holds_every_camera_of_a_large_rig_and_its_volume(tmp_path: Path, plain: Path) -> None:
-    aside = ((0.0, 0.0, -1.0, 0.55), (1.0, 0.0, 0.0, 0.0), (0.0, -1.0, 0.0, 0.42), EYE[3])
+    aside = ((0.0, 0.0, -1.0, 0.55), (1.0, 0.0, 0.0, 0.0), (0.0, -1.0, 0.0, 0.42), (0.0, 0.0, 0.0, 1.0))
     volume = Volume(low_m=(-0.2, -0.2, 0.4), high_m=(0.2, 0.2, 0.8))
     four = replace(
         RIG, cameras=(*RIG.cameras, "aside"), T_rig_camera=RIG.T_rig_camera | {"aside": aside}, volume=volume

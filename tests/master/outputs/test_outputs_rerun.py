@@ -10,9 +10,9 @@ import rerun as rr
 from msgspec.structs import replace
 
 from common.arrays import Image
-from common.calibration import CameraCalibration, Intrinsics, RigCalibration, Volume
+from common.calibration import CameraCalibration, Volume
 from common.errors import PhalanxError, RecordingError
-from common.geometry.transforms import matrix_to_quaternion, rigid
+from common.geometry.transforms import rigid
 from common.hand.model import JOINTS, TIPS, HandModel
 from common.hand.profiles import generated_profile
 from common.messages import Command, HandPose, Health, Preview, Source
@@ -21,35 +21,13 @@ from master.outputs.poses import Poses, PosesTruth
 from master.outputs.rerun import ViewerProcess, run_viewer, viewer_arguments, write_rrd
 from master.outputs.rerun_scene import RerunScene
 from master.rig.setup import RigSetup
-from tests.hand_helpers import detections
+from tests.hand_helpers import camera_file, detections, rig_file
 from tests.memory_bus import LoopbackBus
+from tests.results import pose_of
 
 MODEL = HandModel.of(generated_profile("test-hand", "right"))
-EYE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-SHIFTED = ((1.0, 0.0, 0.0, 0.075), *EYE[1:])
-RIG = RigCalibration(
-    version=1,
-    name="desk",
-    kind="markers",
-    cameras=("left", "right"),
-    hand="test-hand",
-    T_rig_camera={"left": EYE, "right": SHIFTED},
-)
-CAMERAS = {
-    name: CameraCalibration(
-        version=1,
-        name=name,
-        width_px=640,
-        height_px=480,
-        frame_rate_hz=60.0,
-        exposure_us=5000,
-        analogue_gain=1.0,
-        colour_gains=(1.0, 1.0),
-        row_time_us=20.0,
-        intrinsics=Intrinsics(fx_px=500.0, fy_px=500.0, cx_px=319.5, cy_px=239.5),
-    )
-    for name in RIG.cameras
-}
+RIG = rig_file(name="desk", hand="test-hand")
+CAMERAS = {name: camera_file(name, row_time_us=20.0) for name in RIG.cameras}
 SETUP = RigSetup.of(RIG, CAMERAS, MODEL)
 STEP_NS = 16_666_667
 
@@ -70,12 +48,10 @@ def moving_hand(rows: int) -> list[HandPose]:
         if i == 4:
             valid[21:26] = False
         poses.append(
-            HandPose(
-                hand="test-hand",
+            pose_of(
+                MODEL,
+                joints,
                 t_ns=10**15 + i * STEP_NS,
-                position_m=joints.position_m,
-                orientation_wxyz=matrix_to_quaternion(joints.rotation),
-                radius_m=MODEL.radius_m,
                 valid=valid,
                 tracked=valid & (source == Source.MEASURED),
                 cov_m2=np.tile(np.diag([1e-6, 1e-6, 9e-6]), (26, 1, 1)),
@@ -83,8 +59,6 @@ def moving_hand(rows: int) -> list[HandPose]:
                 angles_rad=angles,
                 markers_m=markers,
                 markers_raw_m=markers + 0.001,
-                markers_cov_m2=np.full((len(markers), 3, 3), np.nan),
-                inside_volume=np.ones(26, np.bool_),
                 latency_ns=8_000_000,
             )
         )

@@ -24,6 +24,7 @@ from master.outputs.rerun import write_rrd
 from master.outputs.rerun_results import arc, label_of
 from tests.master.outputs.test_outputs_rerun import SETUP, STEP_NS, Viewing, moving_hand, rows_of
 from tests.memory_bus import LoopbackBus
+from tests.results import EYE_WXYZ, object_pose
 
 START_NS = 10**15
 ROTATED = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, 0.05), (0.0, 0.0, 0.0, 1.0))
@@ -43,17 +44,15 @@ WATCHED = with_fields(SETUP, objects=(BAR,))
 
 def bar(row: int, *, tracked: bool = True, occluded: bool = False, known: bool = True) -> ObjectPose:
     lost = np.nan if not known else 0.0
-    return ObjectPose(
-        object="bar",
+    return object_pose(
+        "bar",
+        np.array([0.01 * row, 0.0, 0.5]) + lost,
+        EYE_WXYZ + lost,
         t_ns=START_NS + row * STEP_NS,
-        position_m=np.array([0.01 * row, 0.0, 0.5]) + lost,
-        orientation_wxyz=np.array([1.0, 0.0, 0.0, 0.0]) + lost,
         cov=np.eye(6) * 1e-6,
         residual_m=1e-3,
         source=int(ObjectSource.MARKERS if tracked else ObjectSource.HELD),
         tracked=tracked,
-        seen=3,
-        expected=3,
         occluded=occluded,
     )
 

@@ -7,6 +7,7 @@ from common.geometry.transforms import matrix_to_quaternion, rigid, rotation_vec
 from common.hand.model import HandModel
 from common.hand.profiles import generated_profile
 from common.messages import HandPose
+from tests import results
 
 FLAT = np.zeros((5, 4))
 MODELS = {side: HandModel.of(generated_profile(f"my-{side}", side)) for side in ("left", "right")}
@@ -23,27 +24,18 @@ def hand_pose(
     model = MODELS[side]
     rotation = rotation_vector_to_matrix(np.zeros(3) if rotation_vector is None else rotation_vector)
     joints = model.forward(rigid(rotation, np.array(place_m)), angles_rad)
-    return pose_of(model.profile.name, joints.position_m, joints.rotation, angles_rad, t_ns)
+    return known_hand(model.profile.name, joints.position_m, joints.rotation, angles_rad, t_ns)
 
 
-def pose_of(name: str, position_m: Float, rotation: Float, angles_rad: Float, t_ns: int) -> HandPose:
+def known_hand(name: str, position_m: Float, rotation: Float, angles_rad: Float, t_ns: int) -> HandPose:
     """A pose of joints (26, 3) and (26, 3, 3), all known."""
-    known = np.ones(26, dtype=bool)
-    none = np.empty((0, 3))
-    return HandPose(
-        name,
-        t_ns,
-        position_m,
-        matrix_to_quaternion(rotation),
-        np.full(26, 0.008),
-        known,
-        known,
-        np.full((26, 3, 3), 1e-6),
-        np.full(26, 2, np.uint8),
-        angles_rad,
-        none,
-        none,
-        np.empty((0, 3, 3)),
-        known,
+    return results.hand_pose(
+        hand=name,
+        t_ns=t_ns,
+        position_m=position_m,
+        orientation_wxyz=matrix_to_quaternion(rotation),
+        radius_m=np.full(26, 0.008),
+        angles_rad=angles_rad,
+        markers_m=np.empty((0, 3)),
         latency_ns=12_000_000,
     )

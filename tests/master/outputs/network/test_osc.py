@@ -10,11 +10,12 @@ from msgspec.structs import replace
 from common.calibration.output_settings import OscOutput
 from common.errors import PhalanxError
 from common.hand.model import FINGERS, JOINTS
-from common.messages import Contact, Gesture, ObjectPose, ResultMessage
+from common.messages import Contact, Gesture, ResultMessage
 from master.outputs.network.conventions import MasterTimes
 from master.outputs.network.osc import Blank, BlankBundle, OscSink, floats, ints
 from tests.master.outputs.network.hands import hand_pose
 from tests.master.outputs.network.osc_reader import Received, packet_of
+from tests.results import object_pose
 
 T_NS, NTP_1970_S = 5_000_000_000, 2_208_988_800
 WALL_NS = 1_700_000_000_250_000_000  # at the master's 0
@@ -73,10 +74,7 @@ def test_what_is_not_known_has_no_message_and_a_left_hand_is_left(ear: socket.so
 
 
 def test_objects_contact_and_gestures_have_addresses_of_their_own(ear: socket.socket) -> None:
-    quaternion = np.array([0.5, 0.5, -0.5, 0.5])
-    wand = ObjectPose(
-        "wand", T_NS, np.array([0.1, 0.2, 0.3]), quaternion, np.eye(6), 0.001, 1, True, 3, 3, False
-    )
+    wand = object_pose("wand", [0.1, 0.2, 0.3], [0.5, 0.5, -0.5, 0.5], t_ns=T_NS)
     touch = np.array([True, False, False, False, True])
     contact = Contact(
         "me", "wand", T_NS, np.arange(5) / 8, np.ones(5), np.zeros((5, 3)), touch, 0.25, held=True
@@ -95,9 +93,7 @@ def test_objects_contact_and_gestures_have_addresses_of_their_own(ear: socket.so
 
 
 def test_a_hand_or_object_of_which_nothing_is_known_is_not_sent(ear: socket.socket) -> None:
-    nowhere = ObjectPose(
-        "wand", T_NS, np.full(3, np.nan), np.full(4, np.nan), np.eye(6), np.nan, 0, False, 0, 0, False
-    )
+    nowhere = object_pose("wand", [np.nan] * 3, [np.nan] * 4, source=0, tracked=False, seen=0)
     lost = replace(hand_pose("left"), position_m=np.full((26, 3), np.nan))
     sink = OscSink(OscOutput(port=ear.getsockname()[1]), MasterTimes())
     for message in (nowhere, lost, hand_pose("left")):

@@ -14,7 +14,7 @@ import zenoh
 from common.calibration.output_settings import Ros2Output
 from common.errors import BusError
 from common.hand.model import JOINTS
-from common.messages import HandPose, ObjectPose, ObjectSource
+from common.messages import HandPose, ObjectSource
 from master.outputs.network.conventions import MasterTimes
 from master.outputs.network.ros2 import (
     ANGLES,
@@ -36,6 +36,7 @@ from tests.master.outputs.network.cdr_reader import (
 )
 from tests.master.outputs.test_outputs_files import random_pose
 from tests.network_helpers import until
+from tests.results import object_pose
 
 # rmw_zenoh's own example, a talker of std_msgs/String; its hash is ROS's.
 STRING = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
@@ -132,10 +133,9 @@ def test_what_is_not_known_is_left_out_and_never_nan() -> None:
 def test_an_object_reads_back_with_its_covariance() -> None:
     cov = np.arange(36.0).reshape(6, 6)
     cov = cov + cov.T
-    pose = ObjectPose(
-        "my-cube.2", 5, np.array([0.1, 0.2, 0.3]), np.array([0.5, 0.5, 0.5, -0.5]), cov, 0.0,
-        int(ObjectSource.TAGS), True, 3, 3, False,
-    )  # fmt: skip
+    pose = object_pose(
+        "my-cube.2", [0.1, 0.2, 0.3], [0.5, 0.5, 0.5, -0.5], cov=cov, source=int(ObjectSource.TAGS)
+    )
     topics = {topic.name: bytes(payload) for topic, payload in object_messages(pose, WALL_NS)}
     frame, numbers, covariance = pose_with_covariance(topics["/phalanx/object/my_cube_2/pose"])
     assert frame == FRAME

@@ -19,7 +19,7 @@ from common.hand.model import FINGER_JOINTS, PALM, WRIST
 from common.messages import HandPose
 from master.outputs.network.conventions import MasterTimes, Side, side_of
 from master.outputs.network.vmc import VmcSink
-from tests.master.outputs.network.hands import MODELS, hand_pose, pose_of
+from tests.master.outputs.network.hands import MODELS, hand_pose, known_hand
 from tests.master.outputs.network.osc_reader import Received, packet_of
 
 SIDES: tuple[Side, ...] = ("left", "right")
@@ -95,7 +95,7 @@ def t_hand(side: Side, bend: dict[int, Float] | None = None) -> HandPose:
             position[joint], rotation[joint] = at, frame
             at = at - 0.03 * frame[:, 2]
     position[PALM] = 0.05 * out
-    return pose_of(side, position, rotation, np.zeros((5, 4)), 10**9)
+    return known_hand(side, position, rotation, np.zeros((5, 4)), 10**9)
 
 
 @pytest.mark.parametrize("side", SIDES)

@@ -11,10 +11,11 @@ from playwright.sync_api import Page
 
 from common.arrays import Float
 from common.calibration.output_settings import WebOutput
-from common.messages import HandPose, ObjectPose
+from common.messages import HandPose
 from master.outputs.web.server import WebSink
 from tests.browser import WAIT_MS, chromium
 from tests.master.outputs.network.hands import hand_pose
+from tests.results import object_pose
 
 WAIT_S = 60.0
 TO_WEBXR = np.array([1.0, -1.0, -1.0])
@@ -129,9 +130,7 @@ def an_object(page: Page, sink: WebSink) -> None:
     """An object is where its pose says, turned by pi about x as the hand is."""
     where, quaternion = np.array([0.1, 0.05, 0.4]), np.array([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])
     sink.write(
-        ObjectPose(
-            "mug", 9, where, quaternion, np.full((6, 6), np.nan), math.nan, 2, True, 3, 3, occluded=False
-        )
+        object_pose("mug", where, quaternion, cov=np.full((6, 6), np.nan), residual_m=math.nan, source=2)
     )
     until(page, "handView.objects.size === 1")
     group = "handView.objects.get('mug').group"

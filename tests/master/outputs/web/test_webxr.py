@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from scipy.spatial.transform import Rotation
 
 from common.hand.model import JOINTS
-from common.messages import HandPose, ObjectPose, Source
+from common.messages import HandPose, Source
 from master.outputs.web import object_json, webxr_json
-from tests.master.outputs.network.hands import hand_pose, pose_of
+from tests.master.outputs.network.hands import hand_pose, known_hand
+from tests.results import object_pose
 
 # WebXR Hand Input, "XRHandJoint": the order in which a hand's joints are iterated.
 FINGER = ("metacarpal", "phalanx-proximal", "phalanx-intermediate", "phalanx-distal", "tip")
@@ -40,15 +42,7 @@ def with_wrist(position_m: list[float], wxyz: list[float]) -> HandPose:
     pose = hand_pose("right")
     position, rotation = np.full((26, 3), np.nan), np.full((26, 4), np.nan)
     position[1], rotation[1] = position_m, wxyz
-    return HandPose(
-        **{
-            field: getattr(pose, field)
-            for field in pose.__struct_fields__
-            if field not in ("position_m", "orientation_wxyz")
-        },
-        position_m=position,
-        orientation_wxyz=rotation,
-    )
+    return replace(pose, position_m=position, orientation_wxyz=rotation)
 
 
 def test_joints_are_those_of_webxr_in_its_order() -> None:
@@ -117,10 +111,9 @@ def test_uncertainty_is_the_root_mean_square_of_the_three_axes() -> None:
     tracked[5] = False
     cov = np.full((26, 3, 3), np.nan)
     cov[1] = np.diag([1e-6, 4e-6, 4e-6])  # 1, 2, 2 mm: sqrt((1 + 4 + 4) / 3)
-    pose = pose_of("my-right", pose.position_m, np.tile(np.eye(3), (26, 1, 1)), pose.angles_rad, 7)
-    changed = {field: getattr(pose, field) for field in pose.__struct_fields__}
-    changed |= {"cov_m2": cov, "tracked": tracked, "source": np.full(26, Source.HELD, np.uint8)}
-    joints = message_of(HandPose(**changed))["joints"]
+    pose = known_hand("my-right", pose.position_m, np.tile(np.eye(3), (26, 1, 1)), pose.angles_rad, 7)
+    held = replace(pose, cov_m2=cov, tracked=tracked, source=np.full(26, Source.HELD, np.uint8))
+    joints = message_of(held)["joints"]
     assert joints[0]["sigma_mm"] == 1.732
     assert joints[1]["sigma_mm"] is None
     assert [joint["tracked"] for joint in joints] == [JOINTS[5] != joint["name"] for joint in joints]
@@ -131,8 +124,8 @@ def test_uncertainty_is_the_root_mean_square_of_the_three_axes() -> None:
 def test_an_object_and_one_that_was_never_seen() -> None:
     def thing(position: list[float], wxyz: list[float]) -> dict[str, Any]:
         cov = np.full((6, 6), np.nan)
-        pose = ObjectPose(
-            "mug", 9, np.array(position), np.array(wxyz), cov, math.nan, 2, True, 3, 3, False, 2_000_000
+        pose = object_pose(
+            "mug", position, wxyz, cov=cov, residual_m=math.nan, source=2, latency_ns=2_000_000
         )
         return json.loads(object_json(pose))
 

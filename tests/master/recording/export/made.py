@@ -6,13 +6,14 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.calibration import save
-from common.geometry.transforms import matrix_to_quaternion, rigid
+from common.geometry.transforms import rigid
 from common.hand.model import HandModel
 from common.hand.profiles import generated_profile
-from common.messages import Contact, Gesture, HandPose, ObjectPose, ObjectSource, ResultMessage, Source
+from common.messages import Contact, Gesture, HandPose, ObjectSource, ResultMessage
 from master.outputs.poses import Poses
 from master.recording.export.motion import Skeleton
 from tests.hand_helpers import any_rotation, natural_angles
+from tests.results import object_pose, pose_of
 
 RIGHT = HandModel.of(generated_profile("made-right", "right"))
 LEFT = HandModel.of(generated_profile("made-left", "left"))
@@ -33,21 +34,16 @@ def poses_of(
         good = np.ones(26, np.bool_) if valid is None else valid[i]
         loose = rng.normal(0.0, loose_m, (26, 3)) if loose_m else np.zeros((26, 3))
         out.append(
-            HandPose(
-                hand=model.profile.name,
+            pose_of(
+                model,
+                joints,
                 t_ns=BEGIN_NS + i * STEP_NS,
                 position_m=np.where(good[:, None], joints.position_m + loose, np.nan),
-                orientation_wxyz=matrix_to_quaternion(joints.rotation),
-                radius_m=model.radius_m,
                 valid=good,
                 tracked=good,
                 cov_m2=np.tile(np.diag([1e-6, 4e-6, 4e-6]), (26, 1, 1)),
-                source=np.full(26, Source.SOLVED),
                 angles_rad=np.full((5, 4), 0.1),
                 markers_m=np.zeros((6, 3)),
-                markers_raw_m=np.zeros((6, 3)),
-                markers_cov_m2=np.zeros((6, 3, 3)),
-                inside_volume=np.ones(26, np.bool_),
             )
         )
     return out
@@ -56,18 +52,14 @@ def poses_of(
 def results(hand: str, t_ns: int = BEGIN_NS) -> list[ResultMessage]:
     """An object, unknown at first, contact with it, and a pinch."""
     nowhere = np.full(3, np.nan)
-    cup = ObjectPose(
-        object="cup",
-        t_ns=t_ns,
-        position_m=nowhere,
-        orientation_wxyz=np.full(4, np.nan),
-        cov=np.full((6, 6), np.nan),
-        residual_m=np.nan,
-        source=ObjectSource.NONE,
-        tracked=False,
-        seen=0,
-        expected=2,
-        occluded=True,
+    lost = {
+        "cov": np.full((6, 6), np.nan),
+        "residual_m": np.nan,
+        "source": ObjectSource.NONE,
+        "tracked": False,
+    }
+    cup = object_pose(
+        "cup", nowhere, np.full(4, np.nan), t_ns=t_ns, seen=0, expected=2, occluded=True, **lost
     )
     touch = Contact(
         hand=hand,
