@@ -36,7 +36,7 @@ LIVE = (
 )
 
 # In simulated time: any worker may have these.
-_SIMULATED = ("handshake", "hostile_solver", "million", "stolen", "twins", "vive_lines", "wrist_link")
+_SIMULATED = ("handshake", "hostile_solver", "million", "stolen", "twins", "vive_lines", "kinds_link")
 SIMULATED = tuple(f"tests/loopback/test_{name}.py" for name in _SIMULATED)
 
 # These solve hands of more free angles, whose kernels no other test needs: two workers would compile them twice.

@@ -160,13 +160,6 @@ def test_late_and_doubled_cycles_are_counted_and_change_nothing(seen: Seen) -> N
     assert plain.counts["late"] == 0
 
 
-def test_the_same_messages_make_the_same_poses(seen: Seen) -> None:
-    some = [message for message in seen[1] if 1e-9 * (message.t_ns - START_NS) < 0.6]
-    for a, b in zip(pushed(door(seen), some), pushed(door(seen), some), strict=True):
-        np.testing.assert_array_equal(a.position_m, b.position_m)
-        np.testing.assert_array_equal(a.cov_m2, b.cov_m2)
-
-
 def test_no_kernel_is_compiled_while_both_track_a_hand(seen: Seen) -> None:
     """Its DIPs are free, as before every wrist device; now and then nothing or something wild is seen."""
     rng, line = np.random.default_rng(4), door(seen)

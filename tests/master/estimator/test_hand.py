@@ -10,7 +10,6 @@ from common.errors import CalibrationError
 from common.geometry.transforms import rigid, rotation_vector_to_matrix
 from common.hand.model import CHAINS, TIPS, HandModel
 from master.estimator.estimator import Estimator
-from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT, Settings
 from tests.hand_helpers import (
     LEFT,
@@ -155,31 +154,17 @@ def test_markers_in_one_line_do_not_fix_a_hand() -> None:
     assert fit(across, small_cov()) is None
 
 
-def test_a_marker_without_a_covariance_is_not_seen() -> None:
-    points = places(palm(), natural_angles(np.random.default_rng(2)))
-    cov = small_cov()
-    cov[1, 0, 2] = np.nan
-    with_nan = found(fit(points, cov))
+@pytest.mark.parametrize(("in_point", "in_cov"), [(np.nan, 0.0), (np.inf, 0.0), (0.0, np.nan)])
+def test_a_marker_whose_point_or_covariance_is_not_whole_is_not_seen(in_point: float, in_cov: float) -> None:
+    points, cov = places(palm(), natural_angles(np.random.default_rng(2))), small_cov()
+    part, part_cov = points.copy(), cov.copy()
+    part[1, 2] += in_point
+    part_cov[1, 0, 2] += in_cov
     points[1] = np.nan
-    without = found(fit(points, small_cov()))
-    np.testing.assert_array_equal(with_nan.angles_rad, without.angles_rad)
-    assert with_nan.marker_chi2[1] == 0.0
-
-
-def test_markers_without_any_covariance_are_no_hand() -> None:
-    points = places(palm(), natural_angles(np.random.default_rng(2)))
+    hand, without = found(fit(part, part_cov)), found(fit(points, cov))
+    np.testing.assert_array_equal(hand.angles_rad, without.angles_rad)
+    assert hand.marker_chi2[1] == 0.0
     assert fit(points, np.full((6, 3, 3), np.nan)) is None
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_point_that_is_nan_in_part_is_not_seen(value: float) -> None:
-    points = places(palm(), natural_angles(np.random.default_rng(2)))
-    points[1, 2] = value
-    part = found(fit(points, small_cov()))
-    points[1] = np.nan
-    np.testing.assert_allclose(
-        part.joints.position_m, found(fit(points, small_cov())).joints.position_m, atol=1e-3
-    )
 
 
 absurd = st.one_of(st.floats(-1.0, 1.0), st.floats(-1e6, 1e6), st.sampled_from([0.0, -1e6, 1e6, 1e12]))
@@ -247,30 +232,6 @@ def test_covariance_is_one_and_grows_with_that_of_the_markers(seed: int, factor:
         assert np.linalg.eigvalsh(cov).min() > -1e-15
     total = [np.trace(hand.cov_m2[TIPS], axis1=1, axis2=2).sum() for hand in (fine, coarse)]
     assert total[1] > total[0]
-
-
-def test_an_unseen_tip_is_less_sure_than_a_seen_one() -> None:
-    points = places(palm(), prior_hand(RIGHT)[0])
-    both = found(fit(points, small_cov()))
-    points[3] = np.nan
-    without = found(fit(points, small_cov()))
-    sigma = [np.sqrt(np.trace(hand.cov_m2[TIPS[3]])) for hand in (both, without)]
-    assert sigma[0] < 3e-3
-    assert sigma[1] > 10e-3
-
-
-def test_the_error_is_as_large_as_the_covariance_says() -> None:
-    """Squared joint errors over their variances average to about 1 for hands drawn near the posture prior."""
-    rng = np.random.default_rng(4)
-    ratio: list[float] = []
-    for _ in range(60):
-        angles, T = natural_angles(rng), palm(rng.uniform(-20.0, 20.0, 3))
-        points = places(T, angles) + rng.multivariate_normal(np.zeros(3), small_cov()[0], 6)
-        hand = found(fit(points, small_cov()))
-        error = hand.joints.position_m - RIGHT.forward(T, angles).position_m
-        variance = np.trace(hand.cov_m2, axis1=1, axis2=2)
-        ratio.append(float(np.mean((error**2).sum(axis=1) / variance)))
-    assert 0.1 < np.mean(ratio) < 3.0
 
 
 def test_the_tilt_of_a_finger_end_lies_across_it() -> None:
@@ -348,16 +309,3 @@ def test_a_first_frame_is_found_from_several_starts_open_to_closed(posture_deg: 
         assert palm_deg(hand.solution, T) < 25.0
         assert joint_mm(hand.solution, RIGHT.forward(T, angles).position_m)[1:].mean() < 15.0
         assert not hand.reinitialised
-
-
-def test_a_first_frame_begins_from_the_pipelines_hand_where_that_fits() -> None:
-    points = places(palm(), natural_angles(np.random.default_rng(7)))
-    reinitialise = found(fit(points, small_cov()))
-    begun = found(fit(points, small_cov(), start=reinitialise))
-    np.testing.assert_allclose(begun.joints.position_m, reinitialise.joints.position_m, atol=1e-3)
-    assert begun.steps <= reinitialise.steps
-
-
-def test_free_angles_are_those_of_the_parameters() -> None:
-    hand = found(fit(places(palm(), natural_angles(np.random.default_rng(8))), small_cov()))
-    np.testing.assert_allclose(HandParameters.of(RIGHT).angles(hand.x), hand.angles_rad, atol=1e-12)

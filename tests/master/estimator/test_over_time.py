@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.hand.model import CHAINS, METACARPALS, PALM, TIPS
@@ -100,15 +98,6 @@ def test_a_hand_that_is_lost_goes_on_a_little_and_stays_inside_its_limits(speed:
     assert history[-1] - history[0] < 0.12 * speed + 12.0
 
 
-def test_covariance_grows_while_a_finger_is_lost() -> None:
-    machine = estimator()
-    seen = run(machine, range(15))[-1]
-    lost = run(machine, range(15, 45), gone=(MARKER_INDEX,), speed_deg_s=60.0)
-    history = [sigma_m(hand, TIPS[INDEX]) for hand in (seen, lost[0], lost[8], lost[25])]
-    assert history[0] < history[1] < history[2] < history[3]
-    assert sigma_m(lost[25], TIPS[2]) < 1.5 * sigma_m(seen, TIPS[2])
-
-
 @pytest.mark.parametrize("gap", [3, 10, 25])
 def test_a_returning_marker_is_accepted_at_once(gap: int) -> None:
     machine = estimator()
@@ -178,28 +167,19 @@ def test_a_palm_is_tracked_only_where_markers_constrain_its_rotation_as_well(
         np.testing.assert_array_equal(hand.tracked[CHAINS[f]], sure(hand)[CHAINS[f]])
 
 
-def test_unrelated_frames_remember_nothing() -> None:
-    machine = estimator(continuous=False)
-    rng = np.random.default_rng(0)
-    first, second = bent_points(natural_angles(rng)), bent_points(natural_angles(rng), (2,))
-    push(machine, 0, first)
-    after = push(machine, STEP_NS, second)
-    alone = push(estimator(continuous=False), STEP_NS, second)
-    assert after.solution is not None
-    assert alone.solution is not None
-    np.testing.assert_array_equal(after.solution.angles_rad, alone.solution.angles_rad)
-
-
 @pytest.mark.parametrize("continuous", [False, True])
-def test_what_was_measured_of_another_hand_tracks_no_finger(continuous: bool) -> None:
+def test_nothing_is_remembered_of_another_hand(continuous: bool) -> None:
     machine, t_ns = estimator(continuous=continuous), 2 * STEP_NS
     for k in range(2):
         push(machine, k * STEP_NS, bent_points(bent(0.1)))
     if continuous:
         t_ns = 0  # the clock was set back: nothing is known
     second = bent_points(natural_angles(np.random.default_rng(0)), (2,))
-    hand, alone = push(machine, t_ns, second), push(estimator(), t_ns, second)
+    hand, alone = push(machine, t_ns, second), push(estimator(continuous=continuous), t_ns, second)
     np.testing.assert_array_equal(hand.tracked, alone.tracked)
+    assert hand.solution is not None
+    assert alone.solution is not None
+    np.testing.assert_array_equal(hand.solution.angles_rad, alone.solution.angles_rad)
 
 
 def test_a_finger_never_seen_is_held_by_the_posture_prior_and_not_tracked() -> None:
@@ -238,16 +218,6 @@ def test_nothing_seen_yet_is_no_hand() -> None:
     assert (pose.source == Source.NONE).all()
 
 
-def test_a_marker_without_covariance_does_not_count_as_seen() -> None:
-    machine = estimator()
-    run(machine, range(5))
-    cov = small_cov()
-    cov[MARKER_INDEX] = np.nan
-    hand = push(machine, 5 * STEP_NS, bent_points(bent(5 / 60)), cov)
-    assert (hand.source[CHAINS[INDEX]] == Source.HELD).all()
-    assert not hand.sources[INDEX]
-
-
 def test_the_message_holds_the_solution() -> None:
     machine = estimator()
     hand = run(machine, range(2))[-1]
@@ -260,23 +230,6 @@ def test_the_message_holds_the_solution() -> None:
     np.testing.assert_array_equal(pose.markers_cov_m2, small_cov())
     assert pose.hand == "made-right"
     assert pose.valid[pose.tracked].all()
-
-
-@given(st.integers(0, 2**32 - 1))
-@settings(max_examples=8)
-def test_a_hand_of_random_markers_never_leaves_its_limits(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    machine, t_ns = estimator(), 0
-    for _ in range(8):
-        t_ns += int(rng.choice([STEP_NS, STEP_NS, STEP_NS, 0, -STEP_NS, 10 * STEP_NS, 10**10]))
-        points = bent_points(natural_angles(rng)) + rng.normal(0.0, 1.0, (6, 3)) * rng.choice(
-            [1e-4, 0.02, 1.0, 1e6]
-        )
-        points[rng.random(6) < 0.3] = np.nan
-        hand = push(machine, t_ns, points)
-        if hand.solution is not None:
-            assert within(RIGHT, hand.solution.angles_rad)
-            assert np.isfinite(hand.solution.joints.position_m).all()
 
 
 def test_a_hand_that_comes_back_elsewhere_is_as_good_as_one_that_is_new() -> None:
@@ -380,34 +333,6 @@ def test_a_finger_that_is_lost_is_tracked_no_longer_than_its_measurement_is_fres
 
 
 # -- the hand of a moment ago was wrong -------------------------------------------------------------------------
-
-
-def test_a_state_that_is_wrong_is_left_at_once_for_the_hand_of_the_line() -> None:
-    """And without such a hand not: what was found is kept."""
-    points, angles = bent_points(bent(0.2)), bent(0.2)
-    shifted = palm(np.array([0.0, 120.0, 0.0]), np.array([0.2, 0.0, 0.7]))
-    line = push(estimator(), 0, points).solution
-    assert line is not None
-    errors = dict[bool, float]()
-    for helped in (True, False):
-        machine = estimator()
-        for k in range(5):
-            push(machine, k * STEP_NS, places(shifted, angles))
-        hand = push(machine, 5 * STEP_NS, points, start=line if helped else None)
-        assert hand.solution is not None
-        assert hand.reinitialised is helped
-        truth = RIGHT.forward(palm(), angles).position_m
-        errors[helped] = float(np.linalg.norm(hand.solution.joints.position_m - truth, axis=1).mean())
-    assert errors[True] < 8e-3
-    assert errors[False] > 2.0 * errors[True]
-
-
-def test_a_hand_that_moves_on_is_not_begun_anew() -> None:
-    machine = estimator()
-    for k in range(40):
-        points = bent_points(bent(k / 60.0))
-        line = push(estimator(), 0, points).solution
-        assert not push(machine, k * STEP_NS, points, start=line).reinitialised
 
 
 def test_a_hand_by_the_posture_prior_is_reinitialised_where_the_last_does_not_fit_a_leap() -> None:

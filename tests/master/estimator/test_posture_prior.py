@@ -218,15 +218,6 @@ def test_a_hidden_finger_that_is_curled_does_not_bend_its_neighbour() -> None:
     assert (np.degrees(hand.angles_rad[2:, 2]) > 60.0).all()
 
 
-def test_a_hidden_finger_between_two_that_show_bends_as_they_do() -> None:
-    truth = np.zeros((5, 4))
-    truth[1:, 1], truth[1:, 2], truth[1:, 3] = 0.45, 0.6, 0.4
-    points = places(palm(), truth)
-    points[3] = np.nan
-    hand = found(fit(points, small_cov()))
-    assert np.degrees(abs(hand.angles_rad[3, 2] - 0.6)) < 20.0
-
-
 # -- limits -----------------------------------------------------------------------------------------------------
 
 

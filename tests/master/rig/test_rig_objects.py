@@ -17,7 +17,7 @@ from master.rig.setup import RigFiles, load_setup, load_setups, setups_with_hand
 from master.run.app import StageTimes
 from master.run.dispatcher import Dispatcher
 from master.run.tuning import LivePipeline, RigTuning, refuse_restart
-from tests.loopback.test_imu_link import sample
+from tests.loopback.test_kinds_link import sample
 from tests.master.rig.test_rig_merge import ASIDE, rows
 
 

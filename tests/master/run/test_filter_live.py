@@ -42,7 +42,7 @@ def published(
 ) -> tuple[Float, Float]:
     """Times (T,) [s] and joints (T, 26, 3) [m] that come once the settings act on this hand."""
     running.hand = hand
-    FilterTuner("bench", Path(), lambda command: running.bus.ask(command, 30.0)).set(settings)
+    FilterTuner("bench", Path(), lambda command: running.live.bus.ask(command, 30.0)).set(settings)
     since_ns = time.monotonic_ns() + SETTLED_NS
     deadline = time.monotonic() + PATIENCE_S
     t: list[float] = []

@@ -1,6 +1,5 @@
 """A live master of a rig with an object: tags, tracker, markers come by datagram, poses and contact go to the bus."""
 
-import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -9,13 +8,11 @@ from shutil import copytree
 import msgspec
 import pytest
 
-from common.bus.keys import new_key
-from common.bus.zenoh_bus import ZenohBus
+from common.bus.bus import Subscription
 from common.calibration import RigCalibration, load, save
 from common.calibration.object_profile import ObjectProfile
 from common.clock import SystemClock
 from common.messages import (
-    Command,
     Contact,
     Gesture,
     HandPose,
@@ -25,10 +22,9 @@ from common.messages import (
 )
 from master.monitor.report import cameras_line
 from master.outputs.result_files import Contacts, ObjectPoses, contact_path, object_path
-from master.rig.setup import RigFiles, load_setups
-from master.run.live import LiveSettings, run_live
-from slave.uplink import Uplink
-from tests.network_helpers import free_endpoint, free_udp_port, until
+from master.rig.setup import RigFiles
+from tests.master.run.live_master import LiveMaster
+from tests.network_helpers import until
 from tests.object_run import (
     START_NS,
     T_OBJECT_TRACKER,
@@ -40,6 +36,7 @@ from tests.object_run import (
 )
 
 FRAMES = 30
+STREAMS = ("hand", "object", "contact", "gesture")
 
 
 @pytest.fixture
@@ -54,81 +51,36 @@ def tree(root: Path, tmp_path: Path) -> Path:
     return tmp_path / "calib"
 
 
-class Master:
-    """A live master and all who send to it."""
-
-    def __init__(self, stack: ExitStack, tree: Path, out: Path) -> None:
-        key, beacon, endpoint = bytes.fromhex(new_key()), free_udp_port(), free_endpoint()
-        setups = load_setups(tree, ("desk-cube",))
-        settings = LiveSettings(
-            ("127.255.255.255", beacon),
-            ("127.0.0.1", 0),
-            endpoint,
-            RigFiles(tree, ("desk-cube",)),
-            5.0,
-            out / "poses.npz",
-            out / "live.json",
-        )
-        self.lines: list[str] = []
-        self.stop = threading.Event()
-        args = (setups, key, settings, self.stop, self.lines.append)
-        self.thread = threading.Thread(target=run_live, args=args)
-        self.thread.start()
-        stack.callback(self.end)
-        self.bus = ZenohBus(None, endpoint)
-        stack.callback(self.bus.close)
-        self.inboxes = {
-            name: self.bus.subscribe(name, depth=4 * FRAMES)
-            for name in ("hand", "object", "contact", "gesture")
-        }
-        names = ("left", "right", "puck")
-        self.ends = {name: Uplink(name, key, SystemClock(), beacon, "127.0.0.1") for name in names}
-        for end in self.ends.values():
-            stack.callback(end.close)
-            assert end.wait_for_start(60.0)
-        self.bus.ask(Command("master", "report"), 5.0)  # who is answered is subscribed
-
-    def counts(self) -> dict[str, int]:
-        return self.bus.ask(Command("master", "report"), 5.0).counts
-
-    def end(self) -> None:
-        self.stop.set()
-        self.thread.join(60.0)
-
-
 @pytest.fixture
-def master(tree: Path, tmp_path: Path) -> Iterator[Master]:
+def master(tree: Path, tmp_path: Path) -> Iterator[LiveMaster]:
     with ExitStack() as stack:
-        yield Master(stack, tree, tmp_path)
+        yield LiveMaster(stack, RigFiles(tree, ("desk-cube",)), ("left", "right", "puck"), tmp_path)
 
 
-def play(shown: ObjectRun, master: Master) -> None:
+def play(shown: ObjectRun, master: LiveMaster) -> None:
     """Send all of the run, at its pace and as if it were now."""
     shift_ns = SystemClock().now_ns() - shown.messages[0].t_ns + 50_000_000
     for one in shown.messages:
-        end = master.ends[one.source if isinstance(one, TrackerPose) else one.camera]
-        changes: dict[str, int] = {"session": end.session, "t_ns": one.t_ns + shift_ns}
+        changes = {"t_ns": one.t_ns + shift_ns}
         if not isinstance(one, TrackerPose):
             changes["ready_t_ns"] = one.ready_t_ns + shift_ns
         due_ns = changes.get("ready_t_ns", changes["t_ns"]) - SystemClock().now_ns()
         master.stop.wait(max(due_ns * 1e-9, 0.0))
-        end.send(msgspec.structs.replace(one, **changes))
+        master.send(one, **changes)
 
 
 def test_objects_and_contact_come_on_the_bus_and_into_files(
-    master: Master, root: Path, tree: Path, tmp_path: Path
+    master: LiveMaster, root: Path, tmp_path: Path
 ) -> None:
-    (setup,) = load_setups(tree, ("desk-cube",))
-    shown = object_run(root, "desk-cube", FRAMES, "grasp", 60, setup)
+    inboxes = {name: master.bus.subscribe(name, depth=4 * FRAMES) for name in STREAMS}
+    master.ask("report")  # who is answered is subscribed
+    shown = object_run(root, "desk-cube", FRAMES, "grasp", 60, master.setups[0])
     play(shown, master)
     assert until(lambda: master.counts().get("left.tags_received", 0) == FRAMES // 3)
     assert until(lambda: any(line.startswith("cameras: left, right; tracker: puck") for line in master.lines))
-    device = [tracker_pose("puck", shown.pose("cube", START_NS), k, k) for k in range(5)]
     master.stop.wait(0.6)  # longer than cameras are preferred
-    for one in device:
-        now_ns = SystemClock().now_ns()
-        puck = master.ends["puck"]
-        puck.send(msgspec.structs.replace(one, session=puck.session, t_ns=now_ns))
+    for k in range(5):
+        master.send(tracker_pose("puck", shown.pose("cube", START_NS), k, SystemClock().now_ns()))
         master.stop.wait(0.01)
     assert until(lambda: master.counts().get("puck.received", 0) == 5)
     counts = master.counts()
@@ -136,7 +88,7 @@ def test_objects_and_contact_come_on_the_bus_and_into_files(
         assert event not in counts, "what never happened is not told"
     assert counts["object.cube.tracked"] >= FRAMES // 2
     master.end()
-    poses = [one for one in drained(master, "object") if isinstance(one, ObjectPose)]
+    poses = [one for one in drained(inboxes["object"]) if isinstance(one, ObjectPose)]
     assert {ObjectSource(one.source) for one in poses if one.tracked} == {
         ObjectSource.TAGS,
         ObjectSource.TRACKER,
@@ -146,13 +98,13 @@ def test_objects_and_contact_come_on_the_bus_and_into_files(
     assert all(one.latency_ns > 0 for one in seen)
     # A tracker's pose is handed over when it holds, on a clock that is known to a fraction of a millisecond.
     assert all(one.latency_ns > -2_000_000 for one in poses)
-    hands = [one for one in drained(master, "hand") if isinstance(one, HandPose)]
-    contacts = [one for one in drained(master, "contact") if isinstance(one, Contact)]
+    hands = [one for one in drained(inboxes["hand"]) if isinstance(one, HandPose)]
+    contacts = [one for one in drained(inboxes["contact"]) if isinstance(one, Contact)]
     assert len(hands) == len(contacts) > 0
     dropped_epochs = counts.get("instants_shed", 0)  # what a busy machine leaves out is counted
     assert len(hands) + dropped_epochs > FRAMES // 2
     assert {(one.hand, one.object) for one in contacts} == {("default-right", "cube")}
-    assert all(isinstance(one, Gesture) for one in drained(master, "gesture"))
+    assert all(isinstance(one, Gesture) for one in drained(inboxes["gesture"]))
     assert len(ObjectPoses.load(object_path(tmp_path, "cube"))) == len(poses)
     assert len(Contacts.load(contact_path(tmp_path, "default-right", "cube"))) == len(contacts)
     report = msgspec.json.decode((tmp_path / "live.json").read_bytes())
@@ -160,9 +112,9 @@ def test_objects_and_contact_come_on_the_bus_and_into_files(
     assert report["object_latency_p50_ms"] > 0.0
 
 
-def drained(master: Master, name: str) -> list[object]:
+def drained(inbox: Subscription) -> list[object]:
     found: list[object] = []
-    while (message := master.inboxes[name].get(0.1)) is not None:
+    while (message := inbox.get(0.1)) is not None:
         found.append(message)
     return found
 

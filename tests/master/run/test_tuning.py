@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import msgspec
@@ -11,22 +11,18 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.bus.keys import new_key
-from common.bus.zenoh_bus import ZenohBus
 from common.calibration import FilterCalibration, ImuCalibration, RigCalibration, save
-from common.clock import SystemClock
 from common.errors import BusError, CalibrationError
 from common.geometry.transforms import matrix_to_quaternion
 from common.hand.model import HandJoints
-from common.messages import Command, HandPose, MarkerDetections
-from master.rig.setup import RigFiles, RigSetup, load_setup
+from common.messages import HandPose
+from master.rig.setup import RigFiles, RigSetup
 from master.run.app import StageTimes
-from master.run.live import LiveSettings, run_live
 from master.run.tuning import LivePipeline, RigTuning
-from slave.uplink import Uplink
 from tests.hand_helpers import MARKERS, RIGHT, camera_file, cap_bias_px, rig_file
 from tests.hand_helpers import detections as seen
-from tests.network_helpers import free_endpoint, free_udp_port, until
+from tests.master.run.live_master import LiveMaster
+from tests.network_helpers import until
 from tests.synthetic_run import SyntheticRun, hand_at, setup_of, synthetic_run
 
 ASIDE_M = 0.1
@@ -263,44 +259,27 @@ class Master:
         sigma_px: Standard deviation of the noise of its centroids.
     """
 
-    def __init__(self, folder: Path, stop: threading.Event) -> None:
+    def __init__(self, stack: ExitStack, folder: Path) -> None:
         self.hand: Callable[[int], HandJoints] = lambda _t_ns: hand_at(0.0)
         self.sigma_px = 0.0
         self.files = tree(folder / "calib")
-        key, beacon, endpoint = bytes.fromhex(new_key()), free_udp_port(), free_endpoint()
-        setup = load_setup(self.files.calibration, "bench")
-        settings = LiveSettings(
-            ("127.255.255.255", beacon),
-            ("127.0.0.1", 0),
-            endpoint,
-            self.files,
-            2.0,
-            folder / "poses.npz",
-        )
-        self.lines: list[str] = []
-        args = ((setup,), key, settings, stop, self.lines.append)
-        self.thread = threading.Thread(target=run_live, args=args)
-        self.thread.start()
-        self.bus = ZenohBus(None, endpoint)
-        self.poses = self.bus.subscribe("hand")
-        self.slaves = {
-            name: Uplink(name, key, SystemClock(), beacon, "127.0.0.1") for name in ("left", "right")
-        }
-        assert all(slave.wait_for_start(60.0) for slave in self.slaves.values())
-        self.sender = threading.Thread(target=self._send, args=(setup, stop))
-        self.sender.start()
+        self.live = LiveMaster(stack, self.files, ("left", "right"), folder)
+        self.poses = self.live.bus.subscribe("hand")
+        sender = threading.Thread(target=self._send)
+        sender.start()
+        stack.callback(sender.join)
+        stack.callback(self.live.stop.set)
 
-    def _send(self, setup: RigSetup, stop: threading.Event) -> None:
-        rng, seq = np.random.default_rng(1), 0
-        while not stop.wait(0.015):
+    def _send(self) -> None:
+        rng, seq, (setup,) = np.random.default_rng(1), 0, self.live.setups
+        while not self.live.stop.wait(0.015):
             t_ns = time.monotonic_ns()
             joints = self.hand(t_ns)
             points = RIGHT.marker_points(joints, MARKERS)
             bias = cap_bias_px(joints, points, tuple(setup.models.values()))
             for c, (name, camera) in enumerate(setup.models.items()):
                 uv = camera.project(points) + bias[c] + rng.normal(0.0, self.sigma_px, (len(MARKERS), 2))
-                message: MarkerDetections = seen(name, seq, t_ns, uv)
-                self.slaves[name].send(msgspec.structs.replace(message, session=self.slaves[name].session))
+                self.live.send(seen(name, seq, t_ns, uv))
             seq += 1
 
     def pose_near(self, x_m: float) -> bool:
@@ -319,17 +298,8 @@ class Master:
 
 @contextmanager
 def master(folder: Path) -> Generator[Master, None, None]:
-    stop = threading.Event()
-    running = Master(folder, stop)
-    try:
-        yield running
-    finally:
-        stop.set()
-        running.sender.join()
-        running.thread.join(60.0)
-        running.bus.close()
-        for slave in running.slaves.values():
-            slave.close()
+    with ExitStack() as stack:
+        yield Master(stack, folder)
 
 
 def test_a_running_master_follows_its_files_and_survives_a_broken_one(tmp_path: Path) -> None:
@@ -340,15 +310,14 @@ def test_a_running_master_follows_its_files_and_survives_a_broken_one(tmp_path: 
         save(path, aside(rig_file()))
         assert running.pose_near(float(home_m[0]) + ASIDE_M)
         path.write_text("{")
-        assert until(lambda: running.bus.ask(Command("master", "report"), 5.0).counts["reload.refused"] == 1)
+        assert until(lambda: running.live.counts()["reload.refused"] == 1)
         with pytest.raises(
             BusError, match=r"'master' refused 'reload': .*bench\.json: Input data was truncated"
         ):
-            running.bus.ask(Command("master", "reload"), 5.0)
+            running.live.ask("reload")
         assert running.pose_near(float(home_m[0]) + ASIDE_M), "the old geometry stays"
         save(path, rig_file())
-        report = running.bus.ask(Command("master", "reload"), 10.0)
-        assert report.counts["reload.applied"] == 2
+        assert running.live.ask("reload").counts["reload.applied"] == 2
         assert running.pose_near(float(home_m[0]))
     with np.load(tmp_path / "poses.npz") as poses:
         steps_ms = np.diff(poses["t_ns"]) * 1e-6

@@ -1,30 +1,24 @@
 """The live master with a wrist device: triples in, poses and figures out; its files may change while it tracks."""
 
 import json
-import threading
-from collections.abc import Generator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 
-from common.bus.keys import new_key
-from common.bus.zenoh_bus import ZenohBus
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load, save
 from common.clock import SystemClock
 from common.errors import CalibrationError
-from common.messages import Command, Health
 from master.outputs.poses import Poses
-from master.rig.setup import RigFiles, RigSetup, load_setup
+from master.rig.setup import RigFiles, load_setup
 from master.run.app import StageTimes
-from master.run.live import LiveSettings, run_live
 from master.run.tuning import LivePipeline, RigTuning
-from slave.uplink import Uplink
-from tests.network_helpers import detections, free_endpoint, free_udp_port, until
-from tests.wrist_run import exact_cycle, wrist_scene, wrist_setup
+from tests.master.run.live_master import LiveMaster
+from tests.network_helpers import detections, until
+from tests.wrist_run import exact_cycle, wrist_scene
 
 
 @pytest.fixture
@@ -49,69 +43,36 @@ def raised(rig: RigCalibration, by_m: float) -> RigCalibration:
     return msgspec.structs.replace(rig, T_camera_palm=tuple(tuple(row) for row in palm))
 
 
-@dataclass
-class Running:
-    """A live master, its camera, somebody who asks, and what the master said."""
-
-    setup: RigSetup
-    camera: Uplink
-    asker: ZenohBus
-    stop: threading.Event
-    lines: list[str] = field(default_factory=list[str])
-    sent: int = 0
-
-    def send(self, count: int) -> None:
-        """Send so many triples at 100 a second, of a hand that opens and closes."""
-        scene, clock = wrist_scene(self.setup, "curl"), SystemClock()
-        for _ in range(count):
-            now = scene.truth(0.02 * self.sent)
-            cycle = exact_cycle(self.setup, now, self.sent, clock.now_ns() - 15_000_000)
-            self.camera.send(msgspec.structs.replace(cycle, session=self.camera.session))
-            self.sent += 1
-            self.stop.wait(0.01)
-
-    def ask(self, verb: str) -> Health:
-        return self.asker.ask(Command("master", verb), 10.0)
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as stack:
+        yield stack
 
 
-@contextmanager
-def running(setup: RigSetup, out: Path, files: RigFiles) -> Generator[Running, None, None]:
-    """A live master with one slave; both end with the block, and the results are in `out`."""
-    key = bytes.fromhex(new_key())
-    beacon, bus = free_udp_port(), free_endpoint()
-    settings = LiveSettings(
-        ("127.255.255.255", beacon), ("127.0.0.1", 0), bus, files, 2.0, out / "poses.npz", out / "live.json"
-    )
-    stop, lines = threading.Event(), list[str]()
-    master = threading.Thread(target=run_live, args=((setup,), key, settings, stop, lines.append))
-    master.start()
-    camera = Uplink("wrist", key, SystemClock(), beacon, "127.0.0.1")
-    asker = ZenohBus(None, bus)
-    try:
-        assert camera.wait_for_start(60.0)
-        yield Running(setup, camera, asker, stop, lines)
-    finally:
-        stop.set()
-        master.join(60.0)
-        for end in (camera, asker):
-            end.close()
-    assert not master.is_alive()
+def send_cycles(live: LiveMaster, count: int, first: int = 0) -> None:
+    """Send so many triples at 100 a second, of a hand that opens and closes."""
+    (setup,) = live.setups
+    scene, clock = wrist_scene(setup, "curl"), SystemClock()
+    for k in range(first, first + count):
+        live.send(exact_cycle(setup, scene.truth(0.02 * k), k, clock.now_ns() - 15_000_000))
+        live.stop.wait(0.01)
 
 
-def test_a_master_tracks_a_wrist_device_and_says_how_it_is(root: Path, tmp_path: Path) -> None:
-    with running(wrist_setup(root), tmp_path, RigFiles(root / "calib_json", ("wrist",))) as run:
-        run.send(40)
-        run.camera.send(
-            detections("wrist", run.camera.session, 400)
-        )  # a wrist's camera that speaks of markers
-        assert until(lambda: run.ask("report").counts.get("refused.impostor") == 1)
-        assert until(lambda: "cameras: wrist" in run.lines)
-        report = run.ask("report")
-        assert report.counts["wrist.received"] == 40
-        assert "wrist.lost" not in report.counts  # nothing was
-        assert report.counts["poses"] > 30
-        assert report.metrics["wrist.clock_sigma_us"] >= 0.0
-        assert not [name for name in report.metrics if "phase" in name or "residual" in name]
+def test_a_master_tracks_a_wrist_device_and_says_how_it_is(
+    stack: ExitStack, root: Path, tmp_path: Path
+) -> None:
+    live = LiveMaster(stack, RigFiles(root / "calib_json", ("wrist",)), ("wrist",), tmp_path)
+    send_cycles(live, 40)
+    live.send(detections("wrist", 1, 400))  # a wrist's camera that speaks of markers
+    assert until(lambda: live.counts().get("refused.impostor") == 1)
+    assert until(lambda: "cameras: wrist" in live.lines)
+    report = live.ask("report")
+    assert report.counts["wrist.received"] == 40
+    assert "wrist.lost" not in report.counts  # nothing was
+    assert report.counts["poses"] > 30
+    assert report.metrics["wrist.clock_sigma_us"] >= 0.0
+    assert not [name for name in report.metrics if "phase" in name or "residual" in name]
+    live.end()
     summary = json.loads((tmp_path / "live.json").read_text())
     poses = Poses.load(tmp_path / "poses.npz")
     assert len(poses) == summary["poses"] > 30
@@ -121,15 +82,15 @@ def test_a_master_tracks_a_wrist_device_and_says_how_it_is(root: Path, tmp_path:
     assert (poses.latency_ns > 0).all()
 
 
-def test_a_changed_palm_pose_is_used_while_it_tracks(tree: Path, tmp_path: Path) -> None:
-    setup = load_setup(tree, "wrist")
-    with running(setup, tmp_path, RigFiles(tree, ("wrist",))) as run:
-        run.send(20)
-        save(tree / "rigs" / "wrist.json", raised(setup.rig, 0.005))
-        run.ask("reload")
-        run.send(20)
-        assert until(lambda: run.ask("report").counts["wrist.received"] == 40)
-        assert run.ask("report").counts["reload.applied"] == 1
+def test_a_changed_palm_pose_is_used_while_it_tracks(stack: ExitStack, tree: Path, tmp_path: Path) -> None:
+    live = LiveMaster(stack, RigFiles(tree, ("wrist",)), ("wrist",), tmp_path)
+    send_cycles(live, 20)
+    save(tree / "rigs" / "wrist.json", raised(live.setups[0].rig, 0.005))
+    live.ask("reload")
+    send_cycles(live, 20, 20)
+    assert until(lambda: live.counts()["wrist.received"] == 40)
+    assert live.counts()["reload.applied"] == 1
+    live.end()
     poses = Poses.load(tmp_path / "poses.npz")
     assert (np.diff(poses.t_ns) > 0).all()
     wrist_y = poses.position_m[:, 1, 1]
