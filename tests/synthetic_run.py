@@ -1,6 +1,7 @@
 """A short run of exact detections of a moving hand: what cameras would report if they made no errors."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -42,20 +43,26 @@ def setup_of(rig: RigCalibration) -> RigSetup:
 
 
 def synthetic_run(frames: int = 40, **changes: object) -> SyntheticRun:
-    """Two cameras at 60 Hz, the right one 5 ms late, rolling shutters."""
+    """Two cameras at 60 Hz, the right one 5 ms late, rolling shutters; changes to the rig leave them where they are."""
     setup = setup_of(rig_file(**changes))  # pyright: ignore[reportArgumentType]
-    messages: list[MarkerDetections] = []
-    for name, camera in setup.models.items():
-        for seq in range(frames):
-            t_ns = 1_000_000_000 + seq * PERIOD_NS + LATE_NS[name]
-            uv = np.full((6, 2), 240.0)
-            for _ in range(4):  # each marker at the time of its own row
-                rows: list[Float] = []
-                for m in range(6):
-                    joints = hand_at(t_ns * 1e-9 + ROW_TIME_US * 1e-6 * float(uv[m, 1]))
-                    points = RIGHT.marker_points(joints, MARKERS)
-                    seen = camera.project(points) + cap_bias_px(joints, points, (camera,))[0]
-                    rows.append(seen[m])
-                uv = np.stack(rows)
-            messages.append(detections(name, seq, t_ns, uv))
+    messages = [_frame(name, seq) for name in setup.models for seq in range(frames)]
     return SyntheticRun(setup, sorted(messages, key=lambda m: m.t_ns))
+
+
+CAMERAS = setup_of(rig_file()).models
+
+
+@cache
+def _frame(name: str, seq: int) -> MarkerDetections:
+    """What a camera sees at a frame, made once."""
+    camera, t_ns = CAMERAS[name], 1_000_000_000 + seq * PERIOD_NS + LATE_NS[name]
+    uv = np.full((6, 2), 240.0)
+    for _ in range(4):  # each marker at the time of its own row
+        rows: list[Float] = []
+        for m in range(6):
+            joints = hand_at(t_ns * 1e-9 + ROW_TIME_US * 1e-6 * float(uv[m, 1]))
+            points = RIGHT.marker_points(joints, MARKERS)
+            seen = camera.project(points) + cap_bias_px(joints, points, (camera,))[0]
+            rows.append(seen[m])
+        uv = np.stack(rows)
+    return detections(name, seq, t_ns, uv)

@@ -4,7 +4,7 @@ import signal
 import statistics
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -214,48 +214,55 @@ def settle(rig: SlavesRig, quiet_s: float, timeout_s: float = 30.0) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """What became of one fault on the list.
+    """What became of faults on the list.
 
     Attributes:
-        shown_s, cleared_s: From the fault to the list that has it, from its end to the list that has it no more [s];
-            None: never.
+        faults: What was put wrong, at once.
+        shown_s, cleared_s: From the last fault to the list that has them all, from their end to the list that has none
+            [s]; None: never.
         shown_reports, cleared_reports: How many of the master's reports, one a second, came in that time.
         others: What else was listed from the fault to the end of what could follow.
-        subjects: Whom it named.
+        subjects: Of each code whom it named.
     """
 
-    fault: Fault
+    faults: Sequence[Fault]
     shown_s: float | None
     cleared_s: float | None
     shown_reports: int
     cleared_reports: int
     others: frozenset[Key]
-    subjects: frozenset[str]
+    subjects: dict[str, frozenset[str]]
 
 
-def rehearse(rig: SlavesRig, fault: Fault, after_s: float = AFTER_S) -> Shown:
-    """Bring it about and away; wait `after_s` for what may follow."""
+def rehearse(rig: SlavesRig, faults: Sequence[Fault], after_s: float = AFTER_S) -> Shown:
+    """Bring them about and away; wait `after_s` for what may follow."""
     settle(rig, after_s)
-    fault.put(rig)
-    put = time.monotonic()
-    reports = rig.lists.reports
-    shown_s = _wait(rig, fault, put, True)
+    began, codes = time.monotonic(), {fault.code for fault in faults}
+    for fault in faults:
+        fault.put(rig)
+    put, reports = time.monotonic(), rig.lists.reports
+    shown_s = _wait(rig, began, codes, codes)
     shown_reports = rig.lists.reports - reports
     time.sleep(after_s)
-    subjects = frozenset(subject for code, subject in rig.lists.now() if code == fault.code)
-    fault.take(rig)
+    now = rig.lists.now()
+    subjects = {one: frozenset(subject for code, subject in now if code == one) for one in codes}
+    for fault in faults:
+        fault.take(rig)
     taken, reports = time.monotonic(), rig.lists.reports
-    cleared_s = _wait(rig, fault, taken, False)
+    cleared_s = _wait(rig, taken, codes, set())
     cleared_reports = rig.lists.reports - reports
     time.sleep(after_s)
-    others = {key for _, keys in rig.lists.since(put) for key in keys if key[0] != fault.code}
-    return Shown(fault, shown_s, cleared_s, shown_reports, cleared_reports, frozenset(others), subjects)
+    others = {key for _, keys in rig.lists.since(began) for key in keys if key[0] not in codes}
+    late_s = None if shown_s is None else max(shown_s - (put - began), 0.0)
+    return Shown(faults, late_s, cleared_s, shown_reports, cleared_reports, frozenset(others), subjects)
 
 
-def _wait(rig: SlavesRig, fault: Fault, since: float, there: bool) -> float | None:
+def _wait(rig: SlavesRig, since: float, codes: Set[str], wanted: Set[str]) -> float | None:
+    """How long [s] until a list came that has of these codes the wanted ones and no other."""
+
     def holds() -> bool:
         lists = rig.lists.since(since)
-        return bool(lists) and any(code == fault.code for code, _ in lists[-1][1]) == there
+        return bool(lists) and {code for code, _ in lists[-1][1]} & codes == wanted
 
     return time.monotonic() - since if until(holds, WAIT_S) else None
 
@@ -279,25 +286,31 @@ def wrong(shown: Shown, reports: int) -> list[str]:
     told = {
         "never shown": shown.shown_s is None,
         "never gone": shown.cleared_s is None,
-        f"of {set(shown.subjects)}": not shown.subjects or not shown.subjects <= shown.fault.subjects,
         f"also told: {set(shown.others)}": not {other for other, _ in shown.others} <= BEHIND,
         f"shown after {shown.shown_reports} reports": shown.shown_reports > NOMINAL + reports,
         f"gone after {shown.cleared_reports} reports": shown.cleared_reports > NOMINAL + reports,
     }
+    for fault in shown.faults:
+        named = shown.subjects[fault.code]
+        told[f"{fault.code} of {set(named)}"] = not named or not named <= fault.subjects
     return [what for what, holds in told.items() if holds]
 
 
-def rehearsed(rig: SlavesRig, fault: Fault, lag: Lag, after_s: float = AFTER_S) -> Shown:
-    """Bring a fault about; once more where it was not as expected and the machine was behind."""
+def rehearsed(rig: SlavesRig, fault: Fault, lag: Lag, after_s: float = AFTER_S) -> frozenset[str]:
+    """Bring a fault about; whom it names."""
+    return rehearsed_together(rig, [fault], lag, after_s).subjects[fault.code]
+
+
+def rehearsed_together(rig: SlavesRig, faults: Sequence[Fault], lag: Lag, after_s: float = AFTER_S) -> Shown:
+    """Bring faults about at once; once more where it was not as expected and the machine was behind."""
     for last in (False, False, True):
         lag.late_s.clear()
-        shown = rehearse(rig, fault, after_s)
+        shown = rehearse(rig, faults, after_s)
         found = wrong(shown, reports(lag))
         if not found:
             return shown
         assert not last, found
         assert lag.worst_s > BEHIND_S, found
-        warnings.warn(
-            f"{fault.code} again, {found}: this machine was {lag.worst_s:.2f} s behind", stacklevel=2
-        )
+        codes = ", ".join(fault.code for fault in faults)
+        warnings.warn(f"{codes} again, {found}: this machine was {lag.worst_s:.2f} s behind", stacklevel=2)
     raise AssertionError("unreachable")

@@ -1,7 +1,7 @@
 """Whoever has a device's own key says what he likes to a real master: it goes on, and so do all others.
 
 One hand before two honest cameras; a third camera of it, a tracker, and a second hand's wrist device are stolen
-(`bench.rigs.hostile`). `python -m bench hostile` is the same with ten times as many messages. Then
+(`bench.rigs.hostile`). `python -m bench hostile` is the same with many times as many messages. Then
 what a device reports on the bus, and what it asks there: nobody's terminal, report or master suffers.
 """
 
@@ -14,10 +14,8 @@ from pathlib import Path
 from shutil import copytree
 
 import msgspec
-import numpy as np
 import pytest
 import zenoh
-from msgspec import Struct
 
 from bench.rigs.hostile import ROOT, STOLEN, HostileRig, Limits, all_attacked, row
 from bench.rigs.hostile_sender import raw_bus
@@ -26,21 +24,14 @@ from common.link.handshake import EchoAnswer
 from common.messages import (
     Command,
     Health,
-    ImuSample,
     MarkerDetections,
     TagDetections,
-    TrackerPose,
-    WristDetections,
     encode,
 )
 from tests.hostile_rigs import (
-    BOUNDS,
-    LATE,
     LEAST,
     MARKERS,
     MOST,
-    PICTURE,
-    READY,
     SEQUENCE,
     SESSION,
     UNASKED,
@@ -52,8 +43,8 @@ from tests.hostile_rigs import (
 )
 from tests.network_helpers import PATIENCE_S, until
 
-MESSAGES, PER_S = 20_000, 2500.0
-COUNTED_S, FLOOD_S = 3.0, 3.0
+MESSAGES, PER_S = 8_000, 2500.0
+COUNTED_S, FLOOD_S = 3.0, 1.5
 OWNED = "pi\x1b]0;owned\x07\u202e"
 GENEROUS = Limits(
     lost=0.3, silent_s=20.0
@@ -72,8 +63,8 @@ def rig(rigs: Rigs) -> HostileRig:
     return rigs.well()
 
 
-def test_twenty_thousand_hostile_messages_of_every_kind_cost_the_others_nothing(rig: HostileRig) -> None:
-    outcomes = all_attacked(rig, tuple(STOLEN), MESSAGES, PER_S, seed=2, calm_s=3.0, limits=GENEROUS)
+def test_thousands_of_hostile_messages_of_every_kind_cost_the_others_nothing(rig: HostileRig) -> None:
+    outcomes = all_attacked(rig, tuple(STOLEN), MESSAGES, PER_S, seed=2, calm_s=1.5, limits=GENEROUS)
     shown = "\n".join(row(one) for one in outcomes)
     assert len(outcomes) == len(STOLEN), shown
     assert sum(one.messages for one in outcomes) == MESSAGES, shown
@@ -139,58 +130,6 @@ def test_a_session_that_is_not_the_hellos_and_a_leaping_seq_are_refused(rig: Hos
         code, output = rig.command(*command)
         assert code in (0, 1), output
         assert b"Traceback" not in output
-
-
-def array(count: int, value: float) -> bytes:
-    return np.full(count, value).tobytes()
-
-
-Absurd = tuple[
-    type[Struct], dict[str, object], tuple[str, ...]
-]  # the field, and the reasons, of which one is counted
-ABSURD: dict[str, list[Absurd]] = {
-    "cam02": [
-        *((MarkerDetections, {"uv": array(12, v)}, (PICTURE, BOUNDS)) for v in (1e9, 1e15, -1e9, 1500.0)),
-        *((MarkerDetections, {name: array(6, 1e300)}, (BOUNDS,)) for name in ("sigma_px", "area", "quality")),
-        (MarkerDetections, {"ready_t_ns": LEAST}, (READY, BOUNDS)),
-        (MarkerDetections, {"ready_t_ns": 0}, (READY,)),
-        (MarkerDetections, {"t_ns": 0, "ready_t_ns": 1000}, (LATE,)),
-        (TagDetections, {"uv": array(24, 1e300)}, (BOUNDS,)),
-        (TagDetections, {"sigma_px": array(3, 1e300)}, (BOUNDS,)),
-        (TagDetections, {"ready_t_ns": 0}, (READY,)),
-    ],
-    "wrist": [
-        (WristDetections, {"laser_uv": array(10, 1e15)}, (PICTURE, BOUNDS)),
-        (WristDetections, {"laser_sigma_px": array(5, 1e300)}, (BOUNDS,)),
-        (WristDetections, {"ready_t_ns": -(2**61)}, (READY,)),
-        (WristDetections, {"t_ns": 0, "ready_t_ns": 1000}, (LATE,)),
-    ],
-    "imu": [
-        (ImuSample, {"heading_sigma_rad": 1e300}, (BOUNDS,)),
-        (ImuSample, {"gyro_rad_s": array(3, 1e300)}, (BOUNDS,)),
-        (ImuSample, {"accel_m_s2": array(3, 1e15)}, (BOUNDS,)),
-        (ImuSample, {"t_ns": 0}, (LATE,)),
-    ],
-    "tracker": [
-        (TrackerPose, {"position_m": array(3, 1e300)}, (BOUNDS,)),
-        (TrackerPose, {"orientation_wxyz": array(4, 1e9)}, (BOUNDS,)),
-        (TrackerPose, {"t_ns": 0}, (LATE,)),
-    ],
-}
-
-
-@pytest.mark.parametrize("device", STOLEN)
-def test_numbers_that_cannot_be_are_refused_for_their_reason(rig: HostileRig, device: str) -> None:
-    """And nobody's pose becomes one that readers cannot decode."""
-    with stolen(rig, device) as sender, unharmed(rig):
-        for kind, changes, reasons in ABSURD[device]:
-            before = refused(counts(rig), *reasons)
-            for _ in range(10):  # of frames in which not all is seen, some are undecodable then
-                sender.send_message(kind)
-                sender.send_message(kind, **changes)
-                time.sleep(0.02)
-            enough = until(lambda: refused(counts(rig), *reasons) >= before + 4, COUNTED_S)  # noqa: B023
-            assert enough, f"{kind.__name__} {list(changes)}: none of {reasons} was counted: {counts(rig)}"
 
 
 def report(session: zenoh.Session, name: str, changes: Mapping[str, object]) -> None:

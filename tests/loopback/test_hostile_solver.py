@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 from msgspec import Struct
 
@@ -16,9 +17,18 @@ from bench.rigs.fuzz import Attack, all_attacks
 from bench.rigs.hostile import HAND, HONEST, RATE_HZ, STOLEN, WRIST_RIG, scratch_tree
 from bench.rigs.hostile_sender import Speaker, own_kinds
 from bench.rigs.rooms import ROOM, detections
-from common.link.datagram import MAX_DATAGRAM, OVERHEAD, Kind
+from common.link.datagram import MAX_DATAGRAM, OVERHEAD, Kind, Refusal
 from common.link.handshake import EchoAnswer, Started
-from common.messages import HandPose, decode, encode
+from common.messages import (
+    HandPose,
+    ImuSample,
+    MarkerDetections,
+    TagDetections,
+    TrackerPose,
+    WristDetections,
+    decode,
+    encode,
+)
 from master.rig.setup import RigSetup, load_setup, load_setups
 from master.run.app import result_at
 from master.run.dispatcher import new_dispatcher
@@ -116,3 +126,63 @@ def test_no_attack_makes_a_solver_raise_or_costs_the_honest_hand_a_pose(tree: Pa
     received = room.link.counts_of(device).received
     assert received > 0.05 * len(groups), "some attacks are within all bounds and reach the solvers"
     assert room.poses >= 0.98 * len(groups) / BETWEEN - 3
+
+
+def array(count: int, value: float) -> bytes:
+    return np.full(count, value).tobytes()
+
+
+# The type, the field, and the reasons, of which one is counted.
+Absurd = tuple[type[Struct], dict[str, object], tuple[Refusal, ...]]
+BOUNDS, PICTURE, READY = Refusal.OUT_OF_BOUNDS, Refusal.OUTSIDE_PICTURE, Refusal.READY_TIME
+LATE: tuple[Refusal, ...] = ()  # counted as a time that no clock explains
+LEAST = -(2**63)
+ABSURD: dict[str, list[Absurd]] = {
+    "cam02": [
+        *((MarkerDetections, {"uv": array(12, v)}, (PICTURE, BOUNDS)) for v in (1e9, 1e15, -1e9, 1500.0)),
+        *((MarkerDetections, {name: array(6, 1e300)}, (BOUNDS,)) for name in ("sigma_px", "area", "quality")),
+        (MarkerDetections, {"ready_t_ns": LEAST}, (READY, BOUNDS)),
+        (MarkerDetections, {"ready_t_ns": 0}, (READY,)),
+        (MarkerDetections, {"t_ns": 0, "ready_t_ns": 1000}, LATE),
+        (TagDetections, {"uv": array(24, 1e300)}, (BOUNDS,)),
+        (TagDetections, {"sigma_px": array(3, 1e300)}, (BOUNDS,)),
+        (TagDetections, {"ready_t_ns": 0}, (READY,)),
+    ],
+    "wrist": [
+        (WristDetections, {"laser_uv": array(10, 1e15)}, (PICTURE, BOUNDS)),
+        (WristDetections, {"laser_sigma_px": array(5, 1e300)}, (BOUNDS,)),
+        (WristDetections, {"ready_t_ns": -(2**61)}, (READY,)),
+        (WristDetections, {"t_ns": 0, "ready_t_ns": 1000}, LATE),
+    ],
+    "imu": [
+        (ImuSample, {"heading_sigma_rad": 1e300}, (BOUNDS,)),
+        (ImuSample, {"gyro_rad_s": array(3, 1e300)}, (BOUNDS,)),
+        (ImuSample, {"accel_m_s2": array(3, 1e15)}, (BOUNDS,)),
+        (ImuSample, {"t_ns": 0}, LATE),
+    ],
+    "tracker": [
+        (TrackerPose, {"position_m": array(3, 1e300)}, (BOUNDS,)),
+        (TrackerPose, {"orientation_wxyz": array(4, 1e9)}, (BOUNDS,)),
+        (TrackerPose, {"t_ns": 0}, LATE),
+    ],
+}
+
+
+def refused(room: Room, reasons: tuple[Refusal, ...]) -> int:
+    """How many were for one of the reasons."""
+    return sum(room.link.refused[reason] for reason in reasons) if reasons else room.link.unsynchronised
+
+
+@pytest.mark.parametrize("device", STOLEN)
+def test_numbers_that_cannot_be_are_refused_for_their_reason(tree: Path, device: str) -> None:
+    room = Room(tree, device)
+    for kind, changes, reasons in ABSURD[device]:
+        room.honest()
+        room.attack(Attack("as it should be", kind))
+        before = refused(room, reasons)
+        for _ in range(10):  # frames in which not all is seen are undecodable then
+            room.attack(Attack("absurd", kind, changes))
+            if refused(room, reasons) > before:
+                break
+        assert refused(room, reasons) == before + 1, f"{kind.__name__} {list(changes)}: {room.link.refused}"
+    assert not room.link.quarantine.faults

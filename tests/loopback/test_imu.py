@@ -173,16 +173,6 @@ def health(bus: ZenohBus) -> Health:
     return bus.ask(Command("palm-imu", "report", ""), PATIENCE_S)
 
 
-def test_it_waits_for_a_master_and_a_signal_ends_it(tmp_path: Path) -> None:
-    log = tmp_path / "imu.log"
-    with process(calibration(tmp_path), log, new_key(), free_udp_port()) as slave:
-        assert until(lambda: "ready, waiting for the master" in log.read_text())
-        assert slave.poll() is None
-        slave.send_signal(signal.SIGINT)
-        assert slave.wait(PATIENCE_S) == 0, log.read_text()
-    assert "0 samples, sent 0" in log.read_text()
-
-
 def test_a_number_that_no_report_can_carry_does_not_silence_it(tmp_path: Path) -> None:
     """What a broken sensor says of its temperature is its own text."""
     files, log, link = calibration(tmp_path), tmp_path / "imu.log", tmp_path / "ttyACM0"

@@ -144,14 +144,14 @@ def test_who_sends_what_another_kind_of_sender_sends_is_an_impostor() -> None:
 def test_mutated_and_forged_ones_are_counted_and_have_no_effect() -> None:
     rig, chance = Everybody(), random.Random(5)
     master = rig.master
-    for forged, kind in enumerate(("tags", "poses"), 1):
+    for forged, kind in enumerate(MAKERS, 1):
         name, make = MAKERS[kind]
         session, body = rig.slaves[name]._session, encode(make(name, rig.slaves[name].process, 1, 0))
         assert session is not None
         forger = Sealer(bytes(32), RigKeys(KEY).rig_tag, session.key_id)  # tag and id are no secrets
         rig.wires.carry(forger.seal(Kind.DATA, body), ("6.6.6.6", 6), MASTER, keep=False)
         assert master.refused[Refusal.FORGED] == forged
-        for _ in range(1000):  # sealed rightly: whoever has the session may send what he likes
+        for _ in range(500):  # sealed rightly: whoever has the session may send what he likes
             broken = bytearray(body)
             for _ in range(chance.randint(1, 3)):
                 at = chance.randrange(len(broken))

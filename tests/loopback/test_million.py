@@ -9,10 +9,10 @@ import pytest
 
 from common.link.datagram import HEADER, MAGIC, MAX_DATAGRAM, Kind, Refusal
 from common.link.handshake import RigKeys
-from common.messages import WIRE_VERSION, encode
+from common.messages import WIRE_VERSION
 from master.run.link import MasterLink
 from slave.link import SlaveLink
-from tests.loopback.test_handshake import KEY, MASTER, Wires, started_pair
+from tests.loopback.test_handshake import KEY, Wires, started_pair
 from tests.network_helpers import detections
 
 BATCH = 10_000
@@ -137,34 +137,3 @@ def test_random_and_mutated_datagrams(wires: Wires) -> None:
     assert left._session is session
     wires.send(left, detections("left", left.process, 100))
     assert wires.got[-1].seq == 100
-
-
-def test_sealed_rubbish_of_a_slave_gone_mad(wires: Wires) -> None:
-    """The sender has the keys and sends rubbish: decoded or refused, never a crash, never kept."""
-    source = random.Random(7)
-    master, left, _ = started_pair(wires)
-    session = left._session
-    assert session is not None
-    whole = encode(detections("left", left.process, 0))
-    kinds = (Kind.DATA, Kind.DATA, Kind.ECHO_ANSWER, Kind.STARTED)
-    for i in range(10_000):
-        body = bytearray(whole)
-        if i % 2:
-            body = bytearray(source.randbytes(source.randrange(120)))
-        else:
-            for _ in range(source.randrange(1, 6)):
-                body[source.randrange(len(body))] = source.randrange(256)
-        datagram = session.sealer.seal(kinds[i % 4], bytes(body))
-        master.receive(datagram, MASTER, wires.clock.now_ns())
-    assert master.refused[Refusal.UNDECODABLE] > 4_000
-    assert set(master.refused) <= {
-        Refusal.UNDECODABLE,
-        Refusal.IMPOSTOR,
-        Refusal.OUT_OF_BOUNDS,
-        Refusal.FOREIGN_SESSION,
-        Refusal.READY_TIME,
-        Refusal.SEQUENCE,
-        Refusal.RATE,
-    }
-    assert not master.quarantine.faults
-    assert len(master._sessions) == 2

@@ -44,8 +44,8 @@ class Sweep:
 def sweeps(datasets: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Sweep]:
     """Both sweeps with detections."""
     out: dict[str, Sweep] = {}
+    tree = colours_of(datasets, tmp_path_factory.mktemp("tree"))
     for name in ("sweep_paper", "sweep_rough"):
-        tree = colours_of(datasets, tmp_path_factory.mktemp("tree"))
         out[name] = Sweep(datasets / "stereo" / name, tmp_path_factory.mktemp(name), tree)
         for camera in CAMERAS:
             detect(out[name].recording, camera, out[name].found, "--calibration", tree)

@@ -60,17 +60,6 @@ def near(point: Float, spread_m: float = 0.02) -> Spot:
     return point, spread_m
 
 
-def test_the_other_camera_distinguishes_a_thing_from_the_marker() -> None:
-    """The left slave takes the mug, the right one is sure: the mug is not on the marker's epipolar line."""
-    for seed in range(20):
-        first, second = seen(PAIR, MUG, MARKER, seed=seed), seen(PAIR, MARKER, None, seed=seed + 100)
-        chosen = choose(PAIR, first, second)
-        np.testing.assert_array_equal(chosen.uv[0], second[0])
-        np.testing.assert_array_equal(chosen.uv[1], first[1])
-        assert chosen.taken.all()
-        assert not chosen.dropped.any()
-
-
 def test_the_slaves_are_followed_where_their_association_fits() -> None:
     others = (seen(PAIR, None, MUG), seen(PAIR, IN_ROW, None), seen(PAIR, IN_ROW, IN_ROW))
     for seed in range(20):
@@ -99,15 +88,6 @@ def test_on_one_epipolar_line_the_last_place_decides() -> None:
     assert not choose(PAIR, first, second, near(IN_ROW, 2.0)).taken.any()
 
 
-def test_a_thing_that_both_slaves_take_for_the_marker_is_left_for_the_hand_not_for_the_past_alone() -> None:
-    first, second = seen(PAIR, MUG, MUG), seen(PAIR, MARKER, MARKER)
-    np.testing.assert_array_equal(
-        choose(PAIR, first, second, near(MARKER)).uv, first
-    )  # a past may be a mistake
-    np.testing.assert_array_equal(choose(PAIR, first, second, near(MARKER), near(MARKER, 0.05)).uv, second)
-    np.testing.assert_array_equal(choose(PAIR, second, first, near(MUG), near(MARKER, 0.05)).uv, second)
-
-
 def test_each_slave_took_another_thing_and_nobody_knows_better() -> None:
     """Both the marker and the mug are consistent, neither is what the slaves chose: dropped, unless expected."""
     first, second = seen(PAIR, MUG, MARKER), seen(PAIR, MARKER, MUG)
@@ -129,11 +109,6 @@ def test_a_marker_that_only_one_camera_shows_is_not_made_of_two_things() -> None
     """The right camera sees the mug alone. Mug and mug meet, but far from where the marker was a frame ago."""
     first, second = seen(PAIR, MARKER, MUG), seen(PAIR, MUG, None)
     assert choose(PAIR, first, second, near(MARKER)).dropped.all()
-
-
-def test_what_fits_nowhere_is_dropped() -> None:
-    elsewhere = np.array([0.0, 0.09, 0.5])
-    assert choose(PAIR, seen(PAIR, MARKER, MUG), seen(PAIR, None, elsewhere)).dropped.all()
 
 
 def test_a_third_camera_needs_no_past() -> None:

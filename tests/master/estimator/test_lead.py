@@ -8,7 +8,6 @@ from master.estimator.smoothing import Blend
 
 STEP_S, SPEED = 1 / 60, 0.12
 ON_PALM = np.array([False, True])
-MARKED = np.full(6, 17 + 256)
 
 
 class Shown:

@@ -10,7 +10,6 @@ from common.hand.model import CHAINS, METACARPALS, PALM, TIPS
 from common.messages import Source
 from common.records import boxed
 from master.estimator.epoch import Fitted, MarkerPositions
-from master.estimator.estimator import pose_of
 from master.estimator.settings import DEFAULT
 from tests.hand_helpers import MARKERS, RIGHT, natural_angles, palm, small_cov, within
 from tests.master.estimator.fitted import (
@@ -204,32 +203,6 @@ def test_time_that_stands_still_or_leaps_starts_anew(step_ns: int) -> None:
     after = push(machine, t_ns + STEP_NS, points)
     assert after.solution is not None
     assert within(RIGHT, after.solution.angles_rad)
-
-
-def test_nothing_seen_yet_is_no_hand() -> None:
-    machine, unseen, vague = estimator(), np.full((6, 3), np.nan), np.full((6, 3, 3), np.nan)
-    hand = push(machine, 0, unseen, vague)
-    assert hand.solution is None
-    assert not hand.valid.any()
-    pose = pose_of(hand, RIGHT, 5, unseen, positions(unseen, vague))
-    assert pose.t_ns == 5
-    assert np.isnan(pose.position_m).all()
-    assert np.isnan(pose.angles_rad).all()
-    assert (pose.source == Source.NONE).all()
-
-
-def test_the_message_holds_the_solution() -> None:
-    machine = estimator()
-    hand = run(machine, range(2))[-1]
-    points = bent_points(bent(1 / 60))
-    pose = pose_of(hand, RIGHT, STEP_NS, points, positions(points + 1e-3, small_cov()))
-    assert hand.solution is not None
-    np.testing.assert_array_equal(pose.position_m, hand.solution.joints.position_m)
-    np.testing.assert_allclose(np.linalg.norm(pose.orientation_wxyz, axis=1), 1.0)
-    np.testing.assert_array_equal(pose.markers_raw_m, points + 1e-3)
-    np.testing.assert_array_equal(pose.markers_cov_m2, small_cov())
-    assert pose.hand == "made-right"
-    assert pose.valid[pose.tracked].all()
 
 
 def test_a_hand_that_comes_back_elsewhere_is_as_good_as_one_that_is_new() -> None:

@@ -16,13 +16,12 @@ from master.rig.pipeline import build_pipeline
 from master.rig.setup import RigSetup
 from master.run.app import StageTimes
 from tests.hand_helpers import MARKERS, RIGHT, detections
-from tests.master.fabrik.runs import run_of
-from tests.synthetic_run import PERIOD_NS, SyntheticRun, hand_at
+from tests.synthetic_run import PERIOD_NS, SyntheticRun, hand_at, synthetic_run
 
 
 @pytest.fixture(scope="module")
 def exact_run() -> SyntheticRun:
-    return run_of(40)
+    return synthetic_run(40)
 
 
 def solve_all(pipeline: MarkerPipeline, messages: list[MarkerDetections]) -> list[HandPose]:
@@ -79,7 +78,7 @@ def test_exact_detections_give_the_hand_back(exact_run: SyntheticRun) -> None:
 def test_the_laws_of_a_parallel_pair_are_its_stereo_geometry(
     exact_run: SyntheticRun, law: dict[str, object]
 ) -> None:
-    run = run_of(12, **law)
+    run = synthetic_run(12, **law)
     poses = solve_all(build_pipeline(run.setup, StageTimes()), run.messages)
     stereo = solve_all(build_pipeline(exact_run.setup, StageTimes()), exact_run.messages[:24])
     for one, other in zip(poses[3:], stereo[3:], strict=True):
@@ -141,7 +140,7 @@ def test_a_thing_that_one_slave_takes_for_a_marker_is_rejected_by_the_other_came
 
 
 def test_a_law_of_disparity_rejects_a_thing_by_the_difference_of_rows() -> None:
-    run = run_of(30, depth_model="power_law", power_law=PowerLawCalibration(k_m=37.5, z=-1.0))
+    run = synthetic_run(30, depth_model="power_law", power_law=PowerLawCalibration(k_m=37.5, z=-1.0))
     pipeline = build_pipeline(run.setup, StageTimes())
     poses = solve_all(pipeline, mistaken(run, OUT_OF_REACH, ("right",), with_alternatives=True))
     assert all(marker_mm(p)[1] < 5.0 for p in poses[3:])
@@ -243,7 +242,11 @@ def test_nothing_seen_at_all_is_a_pose_that_is_not_valid(exact_run: SyntheticRun
     ]
     poses = solve_all(build_pipeline(exact_run.setup, StageTimes()), no_observation)
     assert len(poses) == 5
-    assert not any(p.valid.any() for p in poses)
+    for pose in poses:
+        assert not pose.valid.any()
+        assert (pose.source == Source.NONE).all()
+        assert np.isnan(pose.position_m).all()
+        assert np.isnan(pose.angles_rad).all()
 
 
 def test_unrelated_frames_are_not_filtered(exact_run: SyntheticRun) -> None:

@@ -247,16 +247,6 @@ def test_no_hand_and_a_time_that_stands_still_are_passed_on() -> None:
     assert smooth.push(DT_NS, hand, COV) is hand
 
 
-def test_what_is_not_filtered_stays() -> None:
-    run = Run(*still(RELAXED, 10))
-    for solved, shown in zip(run.solved, run.shown, strict=True):
-        assert solved.solution is not None
-        assert shown.solution is not None
-        assert shown.valid is solved.valid
-        assert shown.source is solved.source
-        assert shown.solution.marker_chi2 is solved.solution.marker_chi2
-
-
 def test_a_hand_that_was_shown_stays_as_it_was() -> None:
     estimator, smooth = machines()
     hands: list[tuple[Fitted, Float]] = []

@@ -19,8 +19,7 @@ from master.rig.pipeline import build_pipeline, line_of
 from master.run.app import StageTimes
 from tests.hand_helpers import LEFT, MARKERS, RIGHT
 from tests.master.fabrik.compiled import compiled
-from tests.master.fabrik.runs import run_of
-from tests.synthetic_run import SyntheticRun
+from tests.synthetic_run import SyntheticRun, synthetic_run
 
 LAWS: list[dict[str, object]] = [
     {"depth_model": "power_law", "power_law": PowerLawCalibration(k_m=37.5, z=-1.0)},
@@ -31,7 +30,7 @@ BEFORE, STORM = 10, 40  # frames of a hand, then frames of anything
 
 @pytest.fixture(scope="module", params=LAWS, ids=["law", "stereo"])
 def run(request: pytest.FixtureRequest) -> SyntheticRun:
-    return run_of(BEFORE + STORM + 20, **request.param)
+    return synthetic_run(BEFORE + STORM + 20, **request.param)
 
 
 def anything(message: MarkerDetections, rng: np.random.Generator) -> MarkerDetections:

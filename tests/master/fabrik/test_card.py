@@ -21,8 +21,7 @@ from master.rig.pipeline import build_pipeline
 from master.rig.setup import RigSetup, load_setup
 from master.run.app import StageTimes
 from tests.hand_helpers import cap_views, detections, natural_angles, palm
-from tests.master.fabrik.runs import run_of
-from tests.synthetic_run import SyntheticRun
+from tests.synthetic_run import SyntheticRun, synthetic_run
 
 FRAMES = 30
 
@@ -83,7 +82,7 @@ def test_every_pose_of_the_shipped_rig_goes_through_law_filter_and_fabrik(
 
 @pytest.fixture(scope="module")
 def run() -> SyntheticRun:
-    return run_of(40)
+    return synthetic_run(40)
 
 
 def errors_after(run: SyntheticRun, T: Callable[[Float], Float], *, start: bool) -> list[float]:

@@ -275,24 +275,6 @@ def test_a_spread_fist_is_never_the_answer(
         assert found.reached
 
 
-def test_a_narrowed_corner_is_the_bounded_least_squares_pose() -> None:
-    # MCP at 70 deg, spread twice as far as is left there: checked on a fine grid of what is legal
-    model = _narrowed(0.0, False)
-    solver = _prepared(model, 1)
-    f, pip = 70 * DEGREE, 30 * DEGREE
-    target = solver.forward((2.0 * _spread(model, 1, f)[1], f, pip, solver.ratio * pip))
-    found = solver.closed_form(target)
-    assert not found.reached
-    best = math.inf
-    for df in np.linspace(-0.25, 0.25, 61):
-        edge = _spread(model, 1, f + float(df))[1]
-        for dp in np.linspace(-0.25, 0.25, 61):
-            p = pip + float(dp)
-            best = min(best, math.dist(solver.forward((edge, f + float(df), p, solver.ratio * p)), target))
-    assert found.residual_m < best + 1e-6
-    assert found.residual_m > 5e-4
-
-
 def test_target_at_the_root_is_flagged() -> None:
     for finger in range(5):
         solver = _solver("right", "K", finger)

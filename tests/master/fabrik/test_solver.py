@@ -12,8 +12,7 @@ from master.fabrik.solver import FORGET_S, FabrikSolver
 from master.rig.pipeline import build_pipeline, line_of
 from master.run.app import StageTimes
 from tests.hand_helpers import RIGHT, detections
-from tests.master.fabrik.runs import run_of
-from tests.synthetic_run import PERIOD_NS, SyntheticRun
+from tests.synthetic_run import PERIOD_NS, SyntheticRun, synthetic_run
 
 PINHOLE = AffineDisparityCalibration(a_m_px=37.5, x0_px=0.0)
 MODELS: list[dict[str, object]] = [
@@ -25,7 +24,7 @@ FAR_M = np.array([0.1, 0.0, 0.15])
 
 @pytest.fixture(scope="module", params=MODELS, ids=["law", "stereo"])
 def run(request: pytest.FixtureRequest) -> SyntheticRun:
-    return run_of(70, **request.param)
+    return synthetic_run(70, **request.param)
 
 
 def line(run: SyntheticRun, *, continuous: bool = True) -> FabrikSolver:
@@ -147,7 +146,7 @@ def test_unrelated_frames_remember_nothing(run: SyntheticRun) -> None:
 
 @pytest.mark.parametrize("model", MODELS)
 def test_the_pipeline_of_solver_fabrik_publishes_this_hand(model: dict[str, object]) -> None:
-    run = run_of(30, solver="fabrik", **model)
+    run = synthetic_run(30, solver="fabrik", **model)
     pipeline = build_pipeline(run.setup, StageTimes())
     poses = [solved.pose for m in run.messages for solved in pipeline.push(m)]
     hands = solve(line(run), run.messages)[: len(poses)]

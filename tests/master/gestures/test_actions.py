@@ -105,23 +105,6 @@ def test_a_pinch_outlasts_a_brief_loss_and_not_a_long_one(model: HandModel) -> N
     assert "end" in run(15 + brief, 2 * brief, lost)
 
 
-def test_a_dial_is_turned_by_the_palm_over_two_grips(model: HandModel) -> None:
-    knob = knob_grip(model, 0.022, STILL)
-    opened = knob.posture_deg + np.array([[14.0, -14.0, -14.0], *[[0.0, -17.0, -16.0]] * 4])
-    palm = np.interp(np.arange(240), [30, 80, 98, 116, 150, 200], [0.0, 50.0, 50.0, -20.0, -20.0, 40.0])
-    loose = np.interp(np.arange(240), [85, 96, 118, 130], [0.0, 1.0, 1.0, 0.0])
-    rotations = np.radians(palm)
-    posture = knob.posture_deg + loose[:, None, None] * (opened - knob.posture_deg)
-    poses = [_pose(model, k, _about(knob.centre_m, knob.axis, rotations[k]), posture[k]) for k in range(240)]
-    gestures = _actions(GestureRecogniser(default_gestures(), model), poses)
-    assert [one.phase for one in gestures if one.phase != "update"] == ["begin"]
-    angle = {one.t_ns // FRAME_NS: np.degrees(one.angle_rad) for one in gestures}
-    assert angle[80] == pytest.approx(50.0, abs=0.1)
-    assert angle[117] == pytest.approx(50.0, abs=1.5)  # the open hand has turned back by 70
-    assert angle[235] == pytest.approx(50.0 + 60.0, abs=2.0)
-    assert float(gestures[-1].direction @ knob.axis) > 0.999
-
-
 def test_a_wrist_device_alone_turns_a_dial_by_its_imu(model: HandModel) -> None:
     knob, recogniser = knob_grip(model, 0.022, STILL), GestureRecogniser(default_gestures(), model)
     gestures: list[Gesture] = []

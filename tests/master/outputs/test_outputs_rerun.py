@@ -327,25 +327,6 @@ def test_an_uncertainty_larger_than_the_fingers_is_not_drawn(tmp_path: Path) -> 
     np.testing.assert_allclose(np.array(centres[0]), pose.position_m[TIPS[[0, 3, 4]]], atol=1e-6)
 
 
-def test_two_hands_at_once_are_two_entities(tmp_path: Path) -> None:
-    bus = LoopbackBus()
-    pose = moving_hand(1)[0]
-    other = replace(
-        pose,
-        hand="other",
-        markers_m=np.zeros((2, 3)),
-        markers_raw_m=np.zeros((2, 3)),
-        markers_cov_m2=np.zeros((2, 3, 3)),
-    )
-    with Viewing(bus, tmp_path / "live.rrd"):
-        bus.publish("hand", pose.hand, pose)
-        bus.publish("hand", other.hand, other)
-    rows = rows_of(tmp_path / "live.rrd")
-    assert rows["/world/hand/test-hand/joints"] == 1
-    assert rows["/world/hand/other/joints"] == 1
-    bus.close()
-
-
 def test_a_place_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -> None:
     path = tmp_path / "nowhere" / "run.rrd"
     with pytest.raises(RecordingError, match=r"run\.rrd: cannot write"):

@@ -4,12 +4,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import rerun as rr
 
-from common.arrays import Float, Image
+from common.arrays import Float
 from common.geometry.transforms import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristTruth
@@ -20,6 +19,7 @@ from master.outputs.picture_overlays import WristPicture
 from master.outputs.poses import Poses, PosesTruth
 from master.outputs.rerun import write_rrd
 from master.rig.setup import RigSetup
+from tests.master.outputs.test_outputs_picture import read
 from tests.master.outputs.test_outputs_rerun import column, rows_of
 from tests.wrist_run import exact_cycle, true_poses, wrist_scene, wrist_setup
 
@@ -45,12 +45,6 @@ def ghost_of(poses: Poses, off_m: float) -> PosesTruth:
         poses.markers_m,
         poses.laser_m + np.array([0.0, off_m, 0.0]),
     )
-
-
-def image_of(path: Path) -> Image:
-    image = cv2.imread(str(path))
-    assert image is not None
-    return np.asarray(image, np.uint8)
 
 
 def statics(path: Path) -> Mapping[str, list[str]]:
@@ -131,7 +125,7 @@ def test_the_picture_shows_the_device_and_what_its_camera_saw(
         path = tmp_path / f"{name}.png"
         row = len(poses) - 1
         draw_summary(path, poses, setup.rig, setup.hand, {"laser_mm": 0.3}, ghost_of(poses, 0.003), row, view)
-        pictures.append(image_of(path).astype(np.float64))
+        pictures.append(read(path).astype(np.float64))
     shown, bare = pictures
     assert shown.shape == (900, 1600, 3)
     differs = np.abs(shown - bare).max(axis=2) > 8.0
@@ -153,7 +147,7 @@ def test_a_pose_of_which_nothing_is_known_can_be_drawn(
     poses.valid[0], poses.tracked[0], poses.position_m[0] = False, False, np.nan
     path = tmp_path / "hand.png"
     draw_summary(path, poses, setup.rig, setup.hand, {}, None, None, WristPicture.of(setup))
-    assert image_of(path).max() > 200
+    assert read(path).max() > 200
     write_rrd(tmp_path / "run.rrd", poses, setup)
     _, points = column(tmp_path / "run.rrd", "/world/laser/points", "positions")
     assert not points[0]

@@ -1,7 +1,6 @@
 """A short recording as a live master would have left it: messages pushed through a `Dispatcher`, and what it told."""
 
 from collections.abc import Sequence
-from functools import cache
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -34,7 +33,6 @@ def report(t_ns: int, session: int = 5, reloads: int = 0) -> Health:
     return Health("master", session, t_ns, {"reload.applied": reloads}, {})
 
 
-@cache
 def scene() -> tuple[MarkerDetections, ...]:
     """What two cameras see of the longest run; shorter ones are its beginning."""
     return tuple(synthetic_run(MOST_FRAMES).messages)

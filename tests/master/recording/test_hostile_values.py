@@ -135,7 +135,7 @@ def spent_s(read: Callable[[Path], None], path: Path) -> float:
     return time.process_time() - before
 
 
-@settings(max_examples=300)
+@settings(max_examples=120)
 @given(data=files())
 def test_any_file_is_refused_or_its_losses_are_counted(data: bytes) -> None:
     with TemporaryDirectory() as folder:

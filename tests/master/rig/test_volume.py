@@ -41,7 +41,7 @@ def test_a_box_has_twelve_edges_each_along_one_axis() -> None:
 
 
 def _poses(volume: Volume | None) -> tuple[list[HandPose], int]:
-    run = synthetic_run(volume=volume)
+    run = synthetic_run(12, volume=volume)
     pipeline = build_pipeline(run.setup, StageTimes())
     poses = [solved.pose for message in run.messages for solved in pipeline.push(message)]
     return poses, pipeline.counts["outside_volume"]

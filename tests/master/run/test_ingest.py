@@ -48,15 +48,6 @@ def test_rubbish_is_counted_by_reason(ingest: Ingest) -> None:
     assert ingest.get(0.0) is None
 
 
-def test_a_slow_reader_gets_the_newest_and_a_count(ingest: Ingest) -> None:
-    for seq in range(QUEUE + 5):
-        ingest.queue.put([detections("left", 1, seq)])
-    first = ingest.get(0.0)
-    assert first is not None
-    assert first.seq == 5
-    assert ingest.counts["queue.dropped"] == 5
-
-
 def test_samples_of_an_imu_drive_no_frame_out(ingest: Ingest) -> None:
     nan = np.full(3, np.nan)
     for seq in range(QUEUE):

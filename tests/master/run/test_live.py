@@ -1,7 +1,6 @@
 """The live master end to end in one process: slaves that send, commands, faults of its solver, and its end."""
 
 import json
-from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -24,12 +23,6 @@ POISON_US = 250_000.0  # the exposure of the triples that the planted fault cann
 TWO_HANDS = ("desk", "wrist-left")
 CAMERAS = ("left", "right")
 CLOCK = SystemClock()
-
-
-@pytest.fixture
-def stack() -> Iterator[ExitStack]:
-    with ExitStack() as stack:
-        yield stack
 
 
 def send_frames(live: LiveMaster, seq: int) -> int:

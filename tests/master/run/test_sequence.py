@@ -79,30 +79,6 @@ def test_what_is_missing_between_cycles(numbers: tuple[int, ...], lost: int) -> 
     assert sequence.counts.lost == lost
 
 
-def test_as_many_are_lost_as_datagrams_can_have_carried_them() -> None:
-    losses = Losses()
-    losses.gap(1, 4, numbers=1, datagrams=2)
-    losses.gap(4, 6, numbers=3, datagrams=1)
-    losses.gap(6, 7, numbers=2, datagrams=0)  # never sent
-    assert losses.lost == 2
-
-
-def test_a_late_datagram_of_another_kind_was_no_lost_message() -> None:
-    losses = Losses()
-    losses.gap(1, 3, numbers=1, datagrams=1)
-    losses.late(2, numbers=0)  # a tag
-    assert losses.lost == 0
-    losses.gap(3, 6, numbers=1, datagrams=2)
-    losses.late(4, numbers=0)
-    assert losses.lost == 1
-    losses.late(5, numbers=1)  # it came after all
-    assert losses.lost == 0
-    losses.late(99, numbers=1)
-    losses.begin_session()
-    losses.late(2, numbers=1)
-    assert losses.lost == 0
-
-
 def test_losses_of_an_hour_cost_no_memory() -> None:
     losses = Losses()
     for k in range(10 * REMEMBERED):

@@ -1,7 +1,6 @@
 """The live master with a wrist device: triples in, poses and figures out; its files may change while it tracks."""
 
 import json
-from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -41,12 +40,6 @@ def raised(rig: RigCalibration, by_m: float) -> RigCalibration:
     palm = [list(row) for row in rig.T_camera_palm]
     palm[1][3] -= by_m
     return msgspec.structs.replace(rig, T_camera_palm=tuple(tuple(row) for row in palm))
-
-
-@pytest.fixture
-def stack() -> Iterator[ExitStack]:
-    with ExitStack() as stack:
-        yield stack
 
 
 def send_cycles(live: LiveMaster, count: int, first: int = 0) -> None:

@@ -1,7 +1,6 @@
 """The OSC output: what arrives at a socket, read by a decoder of the specification."""
 
 import socket
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -19,14 +18,6 @@ from tests.results import object_pose
 
 T_NS, NTP_1970_S = 5_000_000_000, 2_208_988_800
 WALL_NS = 1_700_000_000_250_000_000  # at the master's 0
-
-
-@pytest.fixture
-def ear() -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as received:
-        received.bind(("127.0.0.1", 0))
-        received.settimeout(10.0)
-        yield received
 
 
 def sent(ear: socket.socket, *messages: ResultMessage) -> list[Received]:

@@ -2,7 +2,6 @@
 
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -20,6 +19,7 @@ from master.outputs.network.outputs import DEPTH, OUTPUTS, Counters, Output, Out
 from master.outputs.network.sender import NAME, Housekeeping, Sender, run_sender, settings_of
 from tests.master.outputs.network.hands import hand_pose
 from tests.memory_bus import LoopbackBus
+from tests.network_helpers import until
 
 FILE = Path(__file__).parents[4] / "calib_json" / "outputs" / "default.json"
 OSC_ON = replace(default_outputs(), osc=OscOutput(on=True, port=9001))
@@ -42,14 +42,6 @@ class Kept:
 
     def close(self) -> None:
         self.closed += 1
-
-
-def eventually(condition: Callable[[], bool]) -> None:
-    """Look again until it holds."""
-    end = time.monotonic() + 30.0
-    while not condition():
-        assert time.monotonic() < end, "it never came"
-        time.sleep(0.005)
 
 
 @pytest.fixture
@@ -124,10 +116,10 @@ def test_without_a_default_file_all_is_off_and_another_name_is_an_error(tmp_path
 def test_what_is_on_gets_what_it_is_for_and_what_is_off_nothing(sinks: dict[str, Kept]) -> None:
     one, _ = sender(OSC_ON)
     pose = hand_pose("left")
-    eventually(lambda: one.health().metrics["open.osc"] == 1.0)
+    assert until(lambda: one.health().metrics["open.osc"] == 1.0)
     one.push(pose)
     one.switch("vmc", on=True)
-    eventually(lambda: one.health().metrics["open.vmc"] == 1.0)
+    assert until(lambda: one.health().metrics["open.vmc"] == 1.0)
     one.push(pose)
     one.close()
     assert [len(sink.messages) for sink in sinks.values()] == [2, 1]
@@ -152,12 +144,12 @@ def test_an_output_that_breaks_says_so_once_is_opened_again_and_the_others_go_on
 ) -> None:
     monkeypatch.setattr("master.outputs.network.outputs.FIRST_RETRY_S", 0.01)
     one, output = sender(OSC_ON, "osc", "vmc")
-    eventually(lambda: sinks.keys() == {"osc", "vmc"})
-    eventually(lambda: all(one.health().metrics[f"open.{name}"] for name in sinks))
+    assert until(lambda: sinks.keys() == {"osc", "vmc"})
+    assert until(lambda: all(one.health().metrics[f"open.{name}"] for name in sinks))
     sinks["osc"].broken = True
     first = sinks["osc"]
     one.push(hand_pose("left"))
-    eventually(lambda: sinks["osc"] is not first and one.health().metrics["open.osc"] == 1.0)
+    assert until(lambda: sinks["osc"] is not first and one.health().metrics["open.osc"] == 1.0)
     one.push(hand_pose("left"))
     one.close()
     assert output == ["osc: the cable is out; put it in; tried again", "osc: open again"]
@@ -173,7 +165,7 @@ def test_an_output_that_cannot_open_costs_its_messages_and_says_why_once() -> No
         raise OSError("no such device")
 
     line = OutputLine("lsl", refuse, counters, output.append)
-    eventually(lambda: counters.failed == 1)
+    assert until(lambda: counters.failed == 1)
     line.offer(hand_pose("left"))
     line.close()
     assert output == ["lsl: no such device; tried again"]
@@ -188,9 +180,9 @@ def test_an_output_that_ends_by_an_error_nobody_foresaw_is_closed_and_not_called
 
     sink, counters = Faulty(), Counters()
     line = OutputLine("lsl", lambda: sink, counters, print)
-    eventually(lambda: line.open)
+    assert until(lambda: line.open)
     line.offer(hand_pose("left"))
-    eventually(lambda: not line.open)
+    assert until(lambda: not line.open)
     line.offer(hand_pose("left"))
     assert (sink.closed, counters.sent, counters.dropped) == (1, 0, 1)
     line.close()
@@ -200,10 +192,10 @@ def test_a_slow_output_loses_its_oldest_and_counts_them() -> None:
     gate, counters = threading.Event(), Counters()
     sink = Kept(gate=gate)
     line = OutputLine("web", lambda: sink, counters, print)
-    eventually(lambda: line.open)
+    assert until(lambda: line.open)
     poses = [hand_pose("left", t_ns=number) for number in range(3 * DEPTH)]
     line.offer(poses[0])
-    eventually(lambda: line.waiting == 0)  # its thread holds the first, and waits
+    assert until(lambda: line.waiting == 0)  # its thread holds the first, and waits
     for pose in poses[1:]:
         line.offer(pose)
     assert line.waiting == DEPTH
@@ -225,20 +217,20 @@ def test_the_process_obeys_follows_its_file_and_reports(sinks: dict[str, Kept], 
     thread = threading.Thread(target=run_sender, args=(bus, default_outputs(), path, (), stop, output.append))
     thread.start()
     try:
-        eventually(lambda: NAME in asker.alive())
+        assert until(lambda: NAME in asker.alive())
         assert output == [f"all outputs are off; switch them on in {path}, or name them: --only osc,vmc"]
         answer = asker.ask(Command(NAME, "on", '{"output": "osc"}'), 1.0)
         assert answer.metrics["on.osc"] == 1.0
-        eventually(lambda: asker.ask(Command(NAME, "report"), 1.0).metrics["open.osc"] == 1.0)
+        assert until(lambda: asker.ask(Command(NAME, "report"), 1.0).metrics["open.osc"] == 1.0)
         sink = BusSink(master)
         for number in range(20):
             sink.write(hand_pose("right", t_ns=number))
-        eventually(lambda: len(sinks["osc"].messages) == 20)
+        assert until(lambda: len(sinks["osc"].messages) == 20)
         save(path, replace(default_outputs(), vmc=VmcOutput(on=True)))
-        eventually(lambda: "vmc" in sinks)
+        assert until(lambda: "vmc" in sinks)
         assert asker.ask(Command(NAME, "off", '{"output": "osc"}'), 1.0).metrics["on.osc"] == 0.0
         path.write_text("{")
-        eventually(lambda: any("the settings stay as they were" in line for line in output))
+        assert until(lambda: any("the settings stay as they were" in line for line in output))
         report = reports.get(60.0)
         assert isinstance(report, Health)
         assert report.source == NAME

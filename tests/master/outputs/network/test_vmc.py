@@ -2,7 +2,6 @@
 
 import re
 import socket
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,14 +40,6 @@ class Bone:
 
     position_m: Float
     rotation: Float
-
-
-@pytest.fixture(scope="module")
-def ear() -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as received:
-        received.bind(("127.0.0.1", 0))
-        received.settimeout(10.0)
-        yield received
 
 
 def sent(

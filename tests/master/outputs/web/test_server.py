@@ -6,8 +6,7 @@ import json
 import os
 import re
 import socket
-import time
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 
 import pytest
 from websockets.datastructures import Headers
@@ -21,16 +20,9 @@ from common.messages import Gesture
 from master.outputs.web import static_dir, three_js_path
 from master.outputs.web.server import SEND_BUFFER_BYTES, WebServer, WebSink, foreign
 from tests.master.outputs.network.hands import hand_pose
+from tests.network_helpers import until
 
 WAIT_S = 60.0
-
-
-def until(true: Callable[[], bool]) -> None:
-    """Wait until it is; fail if it never is."""
-    end = time.monotonic() + WAIT_S
-    while not true():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.005)
 
 
 @pytest.fixture
@@ -45,7 +37,7 @@ def joined(server: WebServer, origin: str | None = None) -> ClientConnection:
     before = server.clients
     where = Origin(origin) if origin is not None else None
     client = connect(f"ws://127.0.0.1:{server.port}/hands", open_timeout=WAIT_S, origin=where)
-    until(lambda: server.clients > before)
+    assert until(lambda: server.clients > before)
     return client
 
 
@@ -72,7 +64,7 @@ def test_a_client_receives_every_pose_that_the_sink_was_given() -> None:
             assert message["joints"][0]["position"] == pytest.approx([0.01 * k, 0.0, -0.4], abs=1e-6)
         client.send("ping 12.5")
         assert json.loads(client.recv(WAIT_S)) == {"type": "pong", "ping": "ping 12.5"}
-    until(lambda: sink.server.clients == 0)  # forgotten
+    assert until(lambda: sink.server.clients == 0)  # forgotten
     sink.close()
     sink.close()
     with pytest.raises(PhalanxError, match="ended"):
@@ -108,7 +100,7 @@ def stalled(server: WebServer) -> socket.socket:
 
 def test_a_client_that_stalls_delays_nobody_and_is_then_sent_the_newest(server: WebServer) -> None:
     slow = stalled(server)
-    until(lambda: server.clients == 1)
+    assert until(lambda: server.clients == 1)
     size, count = 20_000, 200  # 4 MB, far more than the buffers between
     with joined(server) as quick:
         for k in range(count):
