@@ -14,10 +14,11 @@ from common.clock import SkewedClock, SystemClock
 from common.link.datagram import Kind, Refusal, Sealer
 from common.link.handshake import RigKeys
 from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose, WristDetections, encode
+from common.messages.streams import sender_of
 from master.run.ingest import CAPACITY, Ingest
 from master.run.link import MasterLink
 from slave.uplink import Uplink
-from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Sent, Wires
+from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Wires
 from tests.network_helpers import PATIENCE_S, clock_known, cycle, detections, free_udp_port, seeded, until
 
 SENDERS = ("left", "wrist", "palm-imu", "puck")
@@ -78,9 +79,9 @@ class Everybody:
         name, make = MAKERS[kind]
         self.wires.send(self.slaves[name], make(name, self.slaves[name].process, seq, t_ns))
 
-    def lose(self, message: Sent) -> None:
+    def lose(self, message: Made) -> None:
         """Sent, and never heard of again."""
-        assert self.slaves[message.camera].seal(message) is not None
+        assert self.slaves[sender_of(message)].seal(message) is not None
 
 
 # -- all kinds ----------------------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from common.messages import (
     TrackerPose,
     WristDetections,
 )
+from common.messages.streams import sender_of
 from master.rig.setup import RigFiles
 from master.run.live import LiveSettings, run_live
 from slave.uplink import Uplink
@@ -66,8 +67,7 @@ class LiveMaster:
 
     def send(self, message: Sent, **changes: int) -> None:
         """Send as the message's own sender in its session."""
-        name = message.camera if hasattr(message, "camera") else message.source
-        end = self.ends[name]
+        end = self.ends[sender_of(message)]
         end.send(msgspec.structs.replace(message, session=end.session, **changes))
 
     def end(self) -> None:
