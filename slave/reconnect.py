@@ -66,7 +66,7 @@ class ReconnectingDriver(Reporting, Generic[ItemT]):
         self._offset = 0  # added to the driver's own numbers
         self._opened_again = False  # and no item was read since
         self._last: tuple[int, int] | None = None  # seq, t_ns
-        self._away_ns: int | None = None  # since when; until an item has come
+        self._lost_ns: int | None = None  # since when; until an item has come
         self._wait_s = self._left_s = first_s
         self._why = ""
         self._counts = Counter({"lost": 0, "back": 0})
@@ -115,8 +115,8 @@ class ReconnectingDriver(Reporting, Generic[ItemT]):
 
     def metrics(self) -> dict[str, float]:
         """`away_s`, how long it has been lost, 0: it is there; those of the driver."""
-        source, away_ns = self._source, self._away_ns
-        away_s = 0.0 if away_ns is None else (self._clock.now_ns() - away_ns) * 1e-9
+        source, lost_ns = self._source, self._lost_ns
+        away_s = 0.0 if lost_ns is None else (self._clock.now_ns() - lost_ns) * 1e-9
         own = {f"{self._prefix}away_s": away_s}
         return own | (self._failures.ask(source.metrics) if isinstance(source, Reporting) else {})
 
@@ -140,8 +140,8 @@ class ReconnectingDriver(Reporting, Generic[ItemT]):
 
     def _lose(self, error: Exception) -> None:
         self._counts["lost"] += 1
-        if self._away_ns is None:
-            self._away_ns = self._clock.now_ns()
+        if self._lost_ns is None:
+            self._lost_ns = self._clock.now_ns()
         self._why = self._failures.log("lost", error)
         self._connection_lost(f"{self._device} lost: {self._why}")
         self._left_s = self._wait_s
@@ -176,10 +176,10 @@ class ReconnectingDriver(Reporting, Generic[ItemT]):
 
     def _numbered(self, item: ItemT) -> ItemT:
         """The item with a number that goes on where the last driver ended."""
-        if self._away_ns is not None and self._ends_absence(item):
+        if self._lost_ns is not None and self._ends_absence(item):
             self._failures.over(f"back after loss number {self._counts['lost']}")
             self._counts["back"] += 1
-            self._away_ns, self._wait_s = None, self._first_s
+            self._lost_ns, self._wait_s = None, self._first_s
         if self._last is not None and (self._opened_again or not self._rate_hz):
             seq, t_ns = self._last
             self._offset = seq + max(1, round((item.t_ns - t_ns) * 1e-9 * self._rate_hz)) - item.seq

@@ -443,14 +443,14 @@ def by_clicks(clicks: Mapping[str, tuple[float, float]], names: tuple[str, ...],
         del uv
         of: dict[int, str] = {}
         for marker in names:
-            away: list[float] = []
+            distances: list[float] = []
             for colour in colours:
                 first = [thing.pixels for thing in colour.things if thing.frame == 0]
                 v, u = np.divmod(first[0], width) if first else (np.array([np.inf]), np.array([np.inf]))
-                away.append(float(np.hypot(u - clicks[marker][0], v - clicks[marker][1]).min()))
-            best = int(np.argmin(away))
+                distances.append(float(np.hypot(u - clicks[marker][0], v - clicks[marker][1]).min()))
+            best = int(np.argmin(distances))
             click_reach = 6.0  # px between a click and the nearest pixel of its marker colour
-            if away[best] > click_reach:
+            if distances[best] > click_reach:
                 raise FitError(f"clicks.{marker}: no moving paint at {clicks[marker]} in the first frame")
             if best in of:
                 raise FitError(f"clicks.{marker}: on the same paint as clicks.{of[best]}")

@@ -79,14 +79,14 @@ def measure_windows(
         height = asked[k, BOTTOM] - asked[k, TOP] + 2 * rules.pad
         width = asked[k, RIGHT] - asked[k, LEFT] + 2 * rules.pad
         largest = max(largest, (height + 2 * EDGE) * (width + 2 * EDGE))
-    room = np.empty(6 * largest, np.uint8)
+    scratch = np.empty(6 * largest, np.uint8)
     levels = np.empty(3 * largest, np.float32)
     ramp = np.arange(largest).astype(np.float32)
     if _ask_ahead(image, asked, rules.pad) > 255:
         return
     for k in range(len(asked)):
         _measure_window(
-            image, table, places, cells, skin, curve, asked[k], rules, answers[k], windows, room, levels, ramp
+            image, table, places, cells, skin, curve, asked[k], rules, answers[k], windows, scratch, levels, ramp
         )
 
 
@@ -116,7 +116,7 @@ def _measure_window(
     rules: Rules,
     answer: Float,
     windows: Float32,
-    room: Image,
+    scratch: Image,
     levels: Float32,
     ramp: Float32,
 ) -> None:
@@ -130,15 +130,15 @@ def _measure_window(
         ask: (7,) box, bit, whether alone, where its window starts in `windows`.
         answer: (14,) zeros; stays so where nothing is found.
         windows: Shares of all windows, flat, zeros.
-        room, levels: For the masks and the light of the largest window, (6 N,) and (3 N,).
+        scratch, levels: For the masks and the light of the largest window, (6 N,) and (3 N,).
     """
     left, top = ask[LEFT] - rules.pad, ask[TOP] - rules.pad
     width, height = ask[RIGHT] + rules.pad - left, ask[BOTTOM] + rules.pad - top
     stride = width + 2 * EDGE
     size = stride * (height + 2 * EDGE)
     # As arrays of their own: the rows of a part of an array could not be vectorised.
-    masks, light = room[: 6 * size].reshape(6, size), levels[: 3 * size].reshape(3, size)
-    classes, kinds, room = masks[4], masks[5], masks[:4]
+    masks, light = scratch[: 6 * size].reshape(6, size), levels[: 3 * size].reshape(3, size)
+    classes, kinds, scratch = masks[4], masks[5], masks[:4]
     classes[:] = 0
     kinds[:] = 0
     light[:] = 0.0
@@ -150,16 +150,16 @@ def _measure_window(
     _classify(image, table, places, cells, skin, curve, ask[BIT], left, top, whole, classes, light)
     if ask[ALONE] == 0:
         _keep_parts_inside(rules.pad + rules.grid - 1, width, height, stride, classes)
-    own, u0, v0, u1, v1 = _box_of_own(whole, classes, room)
+    own, u0, v0, u1, v1 = _box_of_own(whole, classes, scratch)
     if own == 0:
         return
     r = rules.reach
     part = Frame(
         max(u0 - r, x0), max(v0 - r, y0), min(u1 + r, x1), min(v1 + r, y1), stride, x_middle, y_middle
     )
-    _look_around(part, rules, classes, kinds, room)
+    _look_around(part, rules, classes, kinds, scratch)
     ring = _sums_of_ring(whole, rules.every, classes, kinds, light)
-    _drop_thick_others(part, classes, kinds, room)
+    _drop_thick_others(part, classes, kinds, scratch)
     core = _light_over(kinds, CORE, part, light)
     sums = _sums_over(kinds, INNER, part, light, ramp)
     thin = sums[0] < rules.least
@@ -263,11 +263,11 @@ def _keep_parts_inside(inset: int, width: int, height: int, stride: int, classes
 
 
 @compiled
-def _box_of_own(whole: Frame, classes: Image, room: Image) -> tuple[int, int, int, int, int]:
+def _box_of_own(whole: Frame, classes: Image, scratch: Image) -> tuple[int, int, int, int, int]:
     """Pixels of the mask, and their box: left, top, right, bottom, exclusive."""
     count, v0, v1 = 0, whole.y1, whole.y0
     width = whole.x1 - whole.x0
-    columns = room[0][: max(width, 0)]
+    columns = scratch[0][: max(width, 0)]
     columns[:] = 0
     for y in range(whole.y0, whole.y1):
         start = (y + EDGE) * whole.stride + EDGE + whole.x0
@@ -289,20 +289,20 @@ def _box_of_own(whole: Frame, classes: Image, room: Image) -> tuple[int, int, in
 
 
 @compiled
-def _look_around(part: Frame, rules: Rules, classes: Image, kinds: Image, room: Image) -> None:
+def _look_around(part: Frame, rules: Rules, classes: Image, kinds: Image, scratch: Image) -> None:
     """Fill `kinds` from how full of the mask the neighbourhood of 7 x 7 is.
 
     Row by row without a break, over the gaps between rows too: one long loop, and its result in a gap is not used.
     """
     stride = part.stride
     begin, end = (part.y0 + EDGE) * stride, (part.y1 + EDGE) * stride
-    own, half, columns = room[0], room[1], room[2]
+    own, half, columns = scratch[0], scratch[1], scratch[2]
     for p in range(len(classes)):
         own[p] = classes[p] & OWN
     _add(own, half, stride, stride, len(classes) - stride)
     _add_around(half, own, columns, 2 * stride, begin - EDGE, end + EDGE)
     _add(columns, half, 1, begin - EDGE + 1, end + EDGE - 1)
-    full = room[3]
+    full = scratch[3]
     _add_around(half, columns, full, 2, begin, end)
     core, deep, hole = np.uint8(rules.core), np.uint8(rules.deep), np.uint8(rules.hole)
     middle, west, east = own[begin:end], own[begin - 1 : end - 1], own[begin + 1 : end + 1]
@@ -363,11 +363,11 @@ def _sums_of_ring(
 
 
 @compiled
-def _drop_thick_others(part: Frame, classes: Image, kinds: Image, room: Image) -> None:
+def _drop_thick_others(part: Frame, classes: Image, kinds: Image, scratch: Image) -> None:
     """Clear the near mark where 3 x 3 pixels of others fit: a fringe is thinner."""
     stride = part.stride
     begin, end = (part.y0 + EDGE) * stride, (part.y1 + EDGE) * stride
-    a, b = room[0], room[1]
+    a, b = scratch[0], scratch[1]
     count = 0
     for p in range(len(classes)):
         a[p] = classes[p] >> 1

@@ -76,8 +76,8 @@ def fit_gains(colour: Float, reference: Float, weight: Float, known: Float) -> G
     trust, x = weight[seen], known
     rounds = 3
     for _ in range(rounds):
-        away = shift - x
-        distance = _distance(away, information)
+        deviation = shift - x
+        distance = _distance(deviation, information)
         # standard deviations (of three channels, whose mean is 1.6) at which a marker has half its weight
         cauchy = 2.5
         heavy = (trust * (1.0 / (1.0 + (distance / cauchy) ** 2)))[:, None, None] * information
@@ -88,12 +88,12 @@ def fit_gains(colour: Float, reference: Float, weight: Float, known: Float) -> G
     return GainFit(x, residual)
 
 
-def _distance(away: Float, information: Float) -> Float:
+def _distance(deviation: Float, information: Float) -> Float:
     """Mahalanobis distances (M,) of (M, 3) with the inverse covariances (M, 3, 3)."""
-    return np.sqrt((away[:, None] @ information @ away[:, :, None])[:, 0, 0])
+    return np.sqrt((deviation[:, None] @ information @ deviation[:, :, None])[:, 0, 0])
 
 
-def apart(a: Float, b: Float, dim: float = 0.15) -> float:
+def gain_difference(a: Float, b: Float, dim: float = 0.15) -> float:
     """How different two lights (3,) look, in log gains of red or blue against green.
 
     `dim`: what brightness counts against hue: the ranges are wide in it.
@@ -109,7 +109,7 @@ def undone(image: Image, log_gains: Float) -> Image:
 
 def different(a: Float, b: Float) -> bool:
     """Whether two lights, log gains (3,), are clearly different in hue."""
-    return apart(a, b, dim=0.0) > OTHER
+    return gain_difference(a, b, dim=0.0) > OTHER
 
 
 def bounded(log_gains: Float) -> Float:
@@ -264,7 +264,7 @@ def evidence(half: Image, table: ColourTable, reference: Float, log_gains: Float
     score = float(np.maximum(close, 0.0).sum())
     light = bounded(fit.log_gains)
     rounded = 1e-9  # log gains
-    beyond = apart(light, fit.log_gains, dim=0.0) > rounded
+    beyond = gain_difference(light, fit.log_gains, dim=0.0) > rounded
     return LightEvidence(light, score, int((close > 0.0).sum()), beyond=beyond)
 
 

@@ -144,14 +144,14 @@ def _fitted(strength: Float32, circle: Float) -> tuple[float, float, float, floa
         before, here, after = strength[_RAY, at - 1], strength[_RAY, at], strength[_RAY, at + 1]
         curvature = np.minimum(before - 2.0 * here + after, -1e-6)  # a parabola through three samples
         found = _AT[at] + _STEP * np.clip(0.5 * (before - after) / curvature, -0.5, 0.5)
-        away_x, away_y = found * _COS - x, found * _SIN - y
-        away = np.hypot(away_x, away_y)
-        residual = away - radius
+        offset_x, offset_y = found * _COS - x, found * _SIN - y
+        distance = np.hypot(offset_x, offset_y)
+        residual = distance - radius
         faint = 0.5  # edges: what is weaker is none
         own = (here >= faint) & (np.abs(residual) <= tolerance)
         cauchy = 0.4  # of the tolerance
         weight = np.where(here >= faint, 1.0 / (1.0 + np.square(residual / (cauchy * tolerance))), 0.0)
-        jacobian = np.stack([away_x / away, away_y / away, np.ones(RAYS)], axis=1)
+        jacobian = np.stack([offset_x / distance, offset_y / distance, np.ones(RAYS)], axis=1)
         weighted = jacobian * weight[:, None]
         inverse = np.linalg.inv(weighted.T @ jacobian + 1e-3 * np.eye(3))
         circle = circle + inverse @ (weighted.T @ residual)

@@ -58,8 +58,8 @@ def evidence_of(
     sought.
     """
     hue = _hue(*(c / gain for c, gain in zip(seen.colour, gains, strict=True)))
-    middle, apart = 0.5 * (seen.xx + seen.yy), math.hypot(0.5 * (seen.xx - seen.yy), seen.xy)
-    longest, shortest = middle + apart, max(middle - apart, 0.02)
+    middle, half_difference = 0.5 * (seen.xx + seen.yy), math.hypot(0.5 * (seen.xx - seen.yy), seen.xy)
+    longest, shortest = middle + half_difference, max(middle - half_difference, 0.02)
     middle_hue, half = hue_span(colour)
     away = abs((hue - middle_hue + HUES / 2) % HUES - HUES / 2) / (half + 0.5)
     largest_contrast = 20.0  # no marker is the more certain beyond it

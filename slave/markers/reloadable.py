@@ -26,7 +26,7 @@ from slave.cameras.settings import FrameObserver
 from slave.markers.classify import ColourTable, table_of
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.engine import NUMPY, Engine
-from slave.markers.illuminant import apart
+from slave.markers.illuminant import gain_difference
 from slave.markers.scan import ScanChoice
 from slave.markers.white_balance import ColourMonitor, ColourWarning, WhiteBalance
 from slave.tuning import CameraFiles, Prepare
@@ -121,7 +121,7 @@ class LightAdaptiveDetector:
     @property
     def trusted(self) -> bool:
         """Whether colours distinguish markers: light known, and table made for it."""
-        return self._light.trusted and apart(self.log_gains, self._in_use) <= REFUSE
+        return self._light.trusted and gain_difference(self.log_gains, self._in_use) <= REFUSE
 
     def adopt(self, other: "LightAdaptiveDetector") -> None:
         """Take over the tracks and counts, not the light, of another detector."""
@@ -144,7 +144,7 @@ class LightAdaptiveDetector:
         self._light.look(image, t_ns)
         self._adapt()
         found = self.plain.push(image, t_ns)
-        stale = apart(self.log_gains, self._in_use) > REFUSE
+        stale = gain_difference(self.log_gains, self._in_use) > REFUSE
         if self._light.proven and not stale:
             self._learn(found, t_ns)
         self.warnings = [*self._near, *self._light.warnings()]
@@ -165,7 +165,7 @@ class LightAdaptiveDetector:
     def _adapt(self) -> None:
         """Have a table made where the light has moved; use the one that is ready."""
         step = 0.08  # log gains of red or blue against green from which a new table is made: one or two hues
-        if self._making is None and apart(self.log_gains, self._in_use) > step:
+        if self._making is None and gain_difference(self.log_gains, self._in_use) > step:
             gains = self.log_gains
             self._making = gains, self._workers.submit(_white_balanced, self._table, gains, self._engine)
         if self._making is not None and self._making[1].done():

@@ -170,23 +170,23 @@ def _reach(blob: Blob) -> float:
 
 def merged(parts: Iterable[Part]) -> list[Part]:
     """Merge parts that meet, so that no blob lies in two; leave out empty ones."""
-    apart: list[Part] = []
+    disjoint: list[Part] = []
     for part in parts:
         left, top, right, bottom = part
         if left >= right or top >= bottom:
             continue
         k = 0
-        while k < len(apart):
-            x0, y0, x1, y1 = apart[k]
+        while k < len(disjoint):
+            x0, y0, x1, y1 = disjoint[k]
             if left <= x1 and x0 <= right and top <= y1 and y0 <= bottom:
                 left, top = x0 if x0 < left else left, y0 if y0 < top else top
                 right, bottom = x1 if x1 > right else right, y1 if y1 > bottom else bottom
-                del apart[k]
+                del disjoint[k]
                 k = 0  # it may meet now what it did not before
             else:
                 k += 1
-        apart.append((left, top, right, bottom))
-    return apart
+        disjoint.append((left, top, right, bottom))
+    return disjoint
 
 
 def _gathered(found: Sequence[list[list[Blob]]], count: int) -> list[list[Blob]]:

@@ -86,12 +86,12 @@ class Track(NamedTuple):
         At constant velocity for a short time, then anywhere about that place. `roi_margin`: how much wider than the
         marker the window is, share of the image width.
         """
-        away_ns = t_ns - self.t_ns
-        if away_ns > VELOCITY_NS:
+        elapsed_ns = t_ns - self.t_ns
+        if elapsed_ns > VELOCITY_NS:
             growth_per_s = 1.0  # of the image width: about 1 m/s at 0.6 m
-            roi_margin += (away_ns - VELOCITY_NS) * 1e-9 * growth_per_s
-            away_ns = VELOCITY_NS
-        u, v = self.u + self.du * away_ns * 1e-9, self.v + self.dv * away_ns * 1e-9
+            roi_margin += (elapsed_ns - VELOCITY_NS) * 1e-9 * growth_per_s
+            elapsed_ns = VELOCITY_NS
+        u, v = self.u + self.du * elapsed_ns * 1e-9, self.v + self.dv * elapsed_ns * 1e-9
         margin = image_width * roi_margin
         x, y = margin + self.width, margin + self.height
         largest = 4.0  # times the whole area
@@ -200,9 +200,9 @@ def centre_of(share: Float32, shape: Ellipse, u: float, v: float) -> Centre | No
     residual: Float = np.zeros(RAYS)
     rounds = 6
     for iteration in range(rounds):
-        away = points - centre
-        inner = away @ inverse
-        level = np.sqrt(np.maximum((away * inner).sum(axis=1), 1e-9))  # 2 on the ellipse
+        offset = points - centre
+        inner = offset @ inverse
+        level = np.sqrt(np.maximum((offset * inner).sum(axis=1), 1e-9))  # 2 on the ellipse
         slope: Float = inner / level[:, None]
         length = np.sqrt(np.maximum((slope * slope).sum(axis=1), 1e-9))
         residual = (level - 2.0) / length  # distance from the ellipse, outwards positive

@@ -33,10 +33,10 @@ from slave.markers.illuminant import (
     STRIDE,
     ColourDrift,
     LightEvidence,
-    apart,
     at_bound,
     different,
     evidence,
+    gain_difference,
     initial_white_balance,
 )
 
@@ -309,7 +309,7 @@ class WhiteBalance:
     def _change(self, image: Image, change: Change) -> None:
         """Add a change of the light unless an object in front of the camera mimics one."""
         # log gains of red or blue against green between two frames: a lamp was switched, or a hand came near
-        sudden = apart(change.log_gains, np.zeros(3)) > 0.2
+        sudden = gain_difference(change.log_gains, np.zeros(3)) > 0.2
         # share of still points that must agree on a sudden change that the markers do not vouch for
         clear = 0.75
         if sudden and change.agreeing < clear:

@@ -107,7 +107,7 @@ class OpenVrTracker(Reporting):
                 self._stop.wait(left_ns * 1e-9)
                 continue
             self._next_ns += self._period_ns * (1 + (-left_ns) // self._period_ns)
-            self._heed(self._system)
+            self._poll_events(self._system)
             pose = self._ask(self._system)
             if pose is not None:
                 return pose
@@ -127,7 +127,7 @@ class OpenVrTracker(Reporting):
         """Nothing."""
         return {}
 
-    def _heed(self, system: VrSystem) -> None:
+    def _poll_events(self, system: VrSystem) -> None:
         event = self._library.VREvent_t()
         while system.pollNextEvent(event):
             if event.eventType == self._library.VREvent_Quit:

@@ -104,9 +104,9 @@ class Codes:
 
 def _blur(cells: int, width: float) -> Float:
     """Share (cells, cells) of each cell in the light of each, blurred by `width`."""
-    apart = (np.arange(cells)[:, None] - np.arange(cells)).astype(np.float64)
+    offset = (np.arange(cells)[:, None] - np.arange(cells)).astype(np.float64)
     width = max(width, 0.05)
-    weight = normal_law((apart + 0.5) / width) - normal_law((apart - 0.5) / width)
+    weight = normal_law((offset + 0.5) / width) - normal_law((offset - 0.5) / width)
     return weight / weight.sum(axis=1, keepdims=True)
 
 
@@ -329,12 +329,12 @@ def _joined(boxes: list[Box]) -> list[Box]:
     whole: list[Box] = []
     for box in boxes:
         left, top, right, bottom = box
-        apart: list[Box] = []
+        disjoint: list[Box] = []
         for other in whole:
             if left <= other[2] and other[0] <= right and top <= other[3] and other[1] <= bottom:
                 left, top = min(left, other[0]), min(top, other[1])
                 right, bottom = max(right, other[2]), max(bottom, other[3])
             else:
-                apart.append(other)
-        whole = [*apart, (left, top, right, bottom)]
+                disjoint.append(other)
+        whole = [*disjoint, (left, top, right, bottom)]
     return whole

@@ -17,7 +17,7 @@ from common.sim.light import CALIBRATED_KELVIN, LightSchedule
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from slave.markers.detector import Detections, MarkerDetector
-from slave.markers.illuminant import apart
+from slave.markers.illuminant import gain_difference
 from slave.markers.reloadable import LightAdaptiveDetector
 from slave.markers.white_balance import Inline
 
@@ -130,7 +130,7 @@ def outcome(
         if following is not None:
             warned = warned or bool(following.warnings)
             if k >= RATE_HZ:
-                light = apart(following.log_gains, np.log(course.at(t_s).gains_bgr()), dim=0.0)
+                light = gain_difference(following.log_gains, np.log(course.at(t_s).gains_bgr()), dim=0.0)
         missed = int((visible & ~seen).sum())
         unwarned = (0, 0) if warned else (swaps, missed)
         got += Outcome(int(visible.sum()), int((visible & seen).sum()), swaps, wrong, *unwarned, light, 0)

@@ -15,7 +15,7 @@ import pytest
 from common.sim.light import LightSchedule
 from common.sim.render import Renderer
 from slave.markers.detector import MarkerDetector
-from slave.markers.illuminant import apart
+from slave.markers.illuminant import gain_difference
 from slave.markers.reloadable import REFUSE, LightAdaptiveDetector, can_adapt, detector_for
 from slave.markers.white_balance import Inline
 from tests.slave import painted
@@ -110,7 +110,7 @@ def test_while_the_colours_are_behind_nothing_is_reported() -> None:
     assert seen[20:28] == [0] * 8  # the lamp was switched at frame 20
     assert min(seen[29:]) >= 5
     assert detector.refused == 16
-    assert apart(detector.log_gains, np.log(schedule.at(OPEN_S + 2.0).gains_bgr())) < 0.1
+    assert gain_difference(detector.log_gains, np.log(schedule.at(OPEN_S + 2.0).gains_bgr())) < 0.1
 
 
 def test_it_says_that_a_light_is_not_known_and_what_to_do() -> None:
@@ -141,7 +141,7 @@ def test_the_same_frames_give_the_same_detections_and_a_fresh_start_keeps_the_li
         t_ns = round(k * 1e9 / RATE_HZ)
         np.testing.assert_array_equal(one.push(image, t_ns).uv, two.push(image, t_ns).uv)
     fresh = one.fresh()
-    assert apart(fresh.log_gains, np.zeros(3)) > REFUSE
+    assert gain_difference(fresh.log_gains, np.zeros(3)) > REFUSE
     assert np.isfinite(fresh.push(images[-1], 10**9).uv[:, 0]).sum() >= 5
 
 
