@@ -15,7 +15,7 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.geometry.transforms import rigid, skew, transform
-from master.calibrate.adjust import Minimum, Normal, cauchy, minimise, stepped_poses
+from master.calibrate.adjust import Minimum, Normal, cauchy, minimise, stepped_poses, weigh
 
 LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 
@@ -103,8 +103,10 @@ def solve(
     shape_sd_m = 3e-4  # a print glued on a plate by hand: some tenths of a millimetre
     prior_px_m = sigma_px / shape_sd_m if free.shape else 0.0
 
+    images = _stacked(observations, len(start.drawn_m))
+
     def equations(bundle: Bundle) -> Normal:
-        normal = _equations(observations, bundle, mask, prior_px_m, cauchy_px)
+        normal = _equations(images, bundle, mask, prior_px_m, cauchy_px)
         if sigma_px == 0.0:
             return normal
         away, sd = lens_prior(bundle)
@@ -139,7 +141,8 @@ def lens_prior(bundle: Bundle) -> tuple[Float, Float]:
 
 def predict(bundle: Bundle, seen: Observation) -> Float:
     """Pixels (n, 2) where the corners of an observation should be."""
-    points = _camera_points(bundle, seen)[2]
+    on_board = bundle.drawn_m[seen.corners] + bundle.shape_m[seen.corners]
+    points = transform(bundle.T_camera_rig[seen.camera] @ bundle.T_rig_board[seen.view], on_board)
     lens = bundle.lenses[seen.camera]
     uv, _ = cv2.projectPoints(points, _ZERO, _ZERO, _matrix(lens), lens[4:])
     return np.asarray(uv, dtype=np.float64).reshape(-1, 2)
@@ -160,73 +163,89 @@ def _matrix(lens: Float) -> Float:
     return np.array([[lens[0], 0.0, lens[2]], [0.0, lens[1], lens[3]], [0.0, 0.0, 1.0]])
 
 
-def _camera_points(bundle: Bundle, seen: Observation) -> tuple[Float, Float, Float]:
-    """Corners (n, 3) on the board, in the rig's frame, and in the camera's."""
-    on_board = bundle.drawn_m[seen.corners] + bundle.shape_m[seen.corners]
-    in_rig = transform(bundle.T_rig_board[seen.view], on_board)
-    return on_board, in_rig, transform(bundle.T_camera_rig[seen.camera], in_rig)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Images:
+    """All images of one camera in arrays, so that a step needs no loop over images."""
+
+    camera: int
+    views: Int  # (E,) indices into the bundle
+    uv: Float  # (E, N, 2) [px] of all corners; NaN: not seen
 
 
-def _jacobian(seen: Observation, bundle: Bundle) -> tuple[Float, Float, Float, Float, Float]:
-    """Predicted minus seen corners (n, 2), and their derivatives.
+def _stacked(observations: Sequence[Observation], corners: int) -> list[_Images]:
+    found: list[_Images] = []
+    for camera in sorted({seen.camera for seen in observations}):
+        own = [seen for seen in observations if seen.camera == camera]
+        uv = np.full((len(own), corners, 2), np.nan)
+        for into, seen in zip(uv, own, strict=True):
+            into[seen.corners] = seen.uv
+        found.append(_Images(camera, np.array([seen.view for seen in own], np.int64), uv))
+    return found
 
-    By lens (n, 2, 9), pose of camera and of board (n, 2, 6) each, shape (n, 2, 3). A pose rotates by exp(w)
-    on its left and moves by t.
+
+def _jacobian(images: _Images, bundle: Bundle) -> tuple[Float, Float, Float, Float, Float]:
+    """Predicted minus seen corners (E, N, 2), and their derivatives.
+
+    By lens (E, N, 2, 9), pose of camera and of board (E, N, 2, 6) each, shape (E, N, 2, 3). A pose rotates by
+    exp(w) on its left and moves by t.
     """
-    on_board, in_rig, points = _camera_points(bundle, seen)
-    lens = bundle.lenses[seen.camera]
+    T_rig_board, T_camera_rig = bundle.T_rig_board[images.views], bundle.T_camera_rig[images.camera]
+    rotation_v, rotation_c = T_rig_board[:, :3, :3], T_camera_rig[:3, :3]
+    turned = (bundle.drawn_m + bundle.shape_m) @ np.swapaxes(rotation_v, 1, 2)
+    in_rig = turned + T_rig_board[:, None, :3, 3]
+    points, lens = transform(T_camera_rig, in_rig).reshape(-1, 3), bundle.lenses[images.camera]
     projected, derivatives = cv2.projectPoints(points, _ZERO, _ZERO, _matrix(lens), lens[4:])
-    uv = np.asarray(projected, dtype=np.float64).reshape(-1, 2)
-    by_all = np.asarray(derivatives, dtype=np.float64).reshape(len(points), 2, -1)
-    by_point, by_lens = by_all[:, :, 3:6], by_all[:, :, 6:15]
-    rotation_c = bundle.T_camera_rig[seen.camera][:3, :3]
-    rotation_v = bundle.T_rig_board[seen.view][:3, :3]
-    by_camera = np.concatenate([-by_point @ skew(in_rig @ rotation_c.T), by_point], axis=2)
+    off = np.asarray(projected, dtype=np.float64).reshape(images.uv.shape) - images.uv
+    by_all = np.asarray(derivatives, dtype=np.float64).reshape(*off.shape, -1)
+    by_point, by_lens = by_all[..., 3:6], by_all[..., 6:15]
+    by_camera = np.concatenate([-by_point @ skew(in_rig @ rotation_c.T), by_point], axis=-1)
     by_rig = by_point @ rotation_c
-    by_view = np.concatenate([-by_rig @ skew(on_board @ rotation_v.T), by_rig], axis=2)
-    return uv - seen.uv, by_lens, by_camera, by_view, by_rig @ rotation_v
+    by_view = np.concatenate([-by_rig @ skew(turned), by_rig], axis=-1)
+    return off, by_lens, by_camera, by_view, by_rig @ rotation_v[:, None]
 
 
 def _equations(
-    observations: Sequence[Observation],
-    bundle: Bundle,
-    mask: Bool,
-    prior_px_m: float,
-    cauchy_px: float | None,
+    images: Sequence[_Images], bundle: Bundle, mask: Bool, prior_px_m: float, cauchy_px: float | None
 ) -> Normal:
     """Normal equations [px] of the free unknowns, with the prior of the shape."""
     cameras, shape_at = len(bundle.lenses), 15 * len(bundle.lenses)
-    place = np.cumsum(mask) - 1  # of a shared unknown among the free ones
-    normal = Normal(int(mask.sum()), len(bundle.T_rig_board), 6)
+    normal = Normal(len(mask), len(bundle.T_rig_board), 6)
     loss = None if cauchy_px is None else cauchy(cauchy_px)
-    for seen in observations:
-        off, by_lens, by_camera, by_view, by_shape = _jacobian(seen, bundle)
-        if not np.isfinite(off).all():
+    for own in images:
+        off, by_lens, by_camera, by_view, by_shape = _jacobian(own, bundle)
+        if not np.isfinite(off[np.isfinite(own.uv)]).all():
             normal.cost = np.inf  # a board went through a camera: no such step
-        c, rows = seen.camera, off.size
+        c, (count, corners, _) = own.camera, off.shape
         at = np.r_[9 * c : 9 * c + 9, 9 * cameras + 6 * c : 9 * cameras + 6 * c + 6]
-        by = np.concatenate([by_lens, by_camera], axis=2).reshape(rows, -1)
-        if prior_px_m > 0.0:
-            at = np.r_[at, (shape_at + 3 * seen.corners[:, None] + np.arange(3)).ravel()]
-            each = np.arange(len(off))
-            own_shape = np.zeros((*off.shape, len(off), 3))  # a corner's own place moves nothing else
-            own_shape[each, :, each] = by_shape
-            by = np.concatenate([by, own_shape.reshape(rows, -1)], axis=1)
-        free = mask[at]
+        by, rows = np.concatenate([by_lens, by_camera], axis=-1), (count, 2 * corners, -1)
+        flat = off.reshape(count, -1)
         normal.add(
-            off.reshape(1, -1),
-            by[None, :, free],
-            by_view.reshape(1, rows, 6),
-            epochs=np.array([seen.view]),
-            columns=place[at[free]],
-            loss=loss,
-            group=2,
+            flat, by.reshape(rows), by_view.reshape(rows), epochs=own.views, columns=at, loss=loss, group=2
         )
+        if prior_px_m > 0.0:  # a corner's offset moves that corner alone: its rows are blocks
+            weight = weigh(flat, loss, 2)[1].reshape(off.shape)[..., None] ** 2
+            heavy = np.where(weight > 0.0, by_shape * weight, 0.0)
+            places = shape_at + np.arange(3 * corners).reshape(corners, 3)
+            blocks = _einsum("enri,enrj->nij", heavy, by_shape)
+            cross = _einsum("enra,enrj->anj", by, heavy).reshape(len(at), -1)
+            normal.shared[places[:, :, None], places[:, None, :]] += blocks
+            normal.shared[at, shape_at:] += cross
+            normal.shared[shape_at:, at] += cross.T
+            normal.gradient[shape_at:] += _einsum("enri,enr->ni", heavy, off).ravel()
+            mixed = _einsum("enrb,enrj->ebnj", by_view, heavy)
+            normal.mixed[own.views, :, shape_at:] += mixed.reshape(count, 6, -1)
     if prior_px_m > 0.0:
         away, sigma = np.zeros(len(mask)), np.full(len(mask), np.inf)
         away[shape_at:], sigma[shape_at:] = bundle.shape_m.ravel(), 1.0 / prior_px_m
-        normal.add_prior(away[mask], sigma[mask])
+        normal.add_prior(away, sigma)
+    normal.shared, normal.gradient = normal.shared[np.ix_(mask, mask)], normal.gradient[mask]
+    normal.mixed = normal.mixed[..., mask]
     return normal
+
+
+def _einsum(sums: str, a: Float, b: Float) -> Float:
+    """Sums of products where both are known: of corners not seen there are none."""
+    return np.asarray(np.einsum(sums, np.nan_to_num(a), np.nan_to_num(b)), np.float64)
 
 
 def _retracted(bundle: Bundle, shared: Float, own: Float) -> Bundle:
