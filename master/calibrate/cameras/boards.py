@@ -195,6 +195,7 @@ class ImageObservation:
     corners_px: Float
     # standard deviation [px] of the blur of the board's edges, in the direction where it is worse
     blur_px: float
+    speed_px_s: Float | None = None  # of the corners (N, 2); None: not known, or still
 
     @property
     def seen(self) -> int:

@@ -28,6 +28,7 @@ class Observation:
     view: int
     corners: Int  # numbers (n,) of the corners seen
     uv: Float  # their places (n, 2) [px]
+    speed: Float | None = None  # of these places (n, 2) [px/s]; None: not known, or still
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,11 +42,12 @@ class Bundle:
     # this and shape_m: (N, 3) [m] corners of the board as drawn, and the offsets of the real ones
     drawn_m: Float
     shape_m: Float
+    delay_s: Float  # (C,) by which frames were taken later than their times state
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Free:
-    """What is estimated of lenses (C, 9), camera poses (C,) and the board's shape.
+    """What is estimated of lenses (C, 9), poses and delays (C,) and the board's shape.
 
     Poses of the board always are.
     """
@@ -53,6 +55,7 @@ class Free:
     lenses: Bool
     cameras: Bool
     shape: bool
+    delays: Bool | None = None
 
     @classmethod
     def only_boards(cls, bundle: Bundle) -> "Free":
@@ -61,10 +64,10 @@ class Free:
         return cls(lenses, np.zeros(len(lenses), dtype=np.bool_), shape=False)
 
     def mask(self, corners: int) -> Bool:
-        """The shared parameters in a row: lenses, camera poses, shape."""
-        return np.concatenate(
-            [self.lenses.ravel(), np.repeat(self.cameras, 6), np.full(3 * corners, self.shape)]
-        )
+        """The shared parameters in a row: lenses, camera poses, delays, shape."""
+        delays = np.zeros_like(self.cameras) if self.delays is None else self.delays
+        shape = np.full(3 * corners, self.shape)
+        return np.concatenate([self.lenses.ravel(), np.repeat(self.cameras, 6), delays, shape])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,6 +87,10 @@ class Solution:
         """Standard deviations (6,) of a camera's rotation [rad] and shift [m]; 0: held."""
         at = 9 * len(self.bundle.lenses) + 6 * camera
         return np.sqrt(np.diag(self.covariance)[at : at + 6])
+
+    def delay_sd(self, camera: int) -> float:
+        """Standard deviation [s] of a camera's delay; 0: held."""
+        return float(np.sqrt(np.diag(self.covariance)[15 * len(self.bundle.lenses) + camera]))
 
 
 def solve(
@@ -110,9 +117,13 @@ def solve(
         if sigma_px == 0.0:
             return normal
         away, sd = lens_prior(bundle)
-        other = np.full(len(mask) - away.size, np.inf)
-        sigma = np.r_[sd.ravel() / sigma_px, other]
-        normal.add_prior(np.r_[away.ravel(), np.zeros(other.size)][mask], sigma[mask])
+        known, cameras = np.zeros(len(mask)), len(away)
+        known[: away.size], known[15 * cameras : 16 * cameras] = away.ravel(), bundle.delay_s
+        sigma = np.full(len(mask), np.inf)
+        usual_s = 0.1  # a few frames in the buffers of a driver
+        sigma[: away.size], sigma[15 * cameras : 16 * cameras] = sd.ravel() / sigma_px, usual_s / sigma_px
+        normal.add_prior(known[mask], sigma[mask])
+        _add_unfolded(normal, bundle, free.lenses, sigma_px)
         return normal
 
     def stepped(bundle: Bundle, step: Float, own: Float) -> Bundle:
@@ -139,13 +150,31 @@ def lens_prior(bundle: Bundle) -> tuple[Float, Float]:
     return away, sd
 
 
+def _add_unfolded(normal: Normal, bundle: Bundle, free: Bool, sigma_px: float) -> None:
+    """Add the prior that a lens does not fold in its image.
+
+    At the corner of the image the derivative 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6 of its distortion is 1 +- 0.3.
+    """
+    first = np.cumsum(free.ravel()).reshape(free.shape) - 1
+    for lens, centre, kept, column in zip(bundle.lenses, bundle.centre_px, free, first, strict=True):
+        if kept[:4].all():
+            terms = kept & np.isin(np.arange(9), (4, 5, 8))
+            r2 = float(((centre / lens[:2]) ** 2).sum())
+            by = np.array([0, 0, 0, 0, 3 * r2, 5 * r2**2, 0, 0, 7 * r2**3]) * sigma_px / 0.3
+            at, row, away = column[terms], by[terms], float(by @ lens)
+            normal.cost += away**2
+            normal.shared[np.ix_(at, at)] += np.outer(row, row)
+            normal.gradient[at] += row * away
+
+
 def predict(bundle: Bundle, seen: Observation) -> Float:
-    """Pixels (n, 2) where the corners of an observation should be."""
+    """Pixels (n, 2) where the corners of an observation should be, as of its time."""
     on_board = bundle.drawn_m[seen.corners] + bundle.shape_m[seen.corners]
     points = transform(bundle.T_camera_rig[seen.camera] @ bundle.T_rig_board[seen.view], on_board)
     lens = bundle.lenses[seen.camera]
     uv, _ = cv2.projectPoints(points, _ZERO, _ZERO, _matrix(lens), lens[4:])
-    return np.asarray(uv, dtype=np.float64).reshape(-1, 2)
+    found = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
+    return found if seen.speed is None else found - seen.speed * bundle.delay_s[seen.camera]
 
 
 def rms(residuals: Sequence[Float]) -> float:
@@ -170,16 +199,19 @@ class _Images:
     camera: int
     views: Int  # (E,) indices into the bundle
     uv: Float  # (E, N, 2) [px] of all corners; NaN: not seen
+    speed: Float  # (E, N, 2) [px/s]
 
 
 def _stacked(observations: Sequence[Observation], corners: int) -> list[_Images]:
     found: list[_Images] = []
     for camera in sorted({seen.camera for seen in observations}):
         own = [seen for seen in observations if seen.camera == camera]
-        uv = np.full((len(own), corners, 2), np.nan)
-        for into, seen in zip(uv, own, strict=True):
-            into[seen.corners] = seen.uv
-        found.append(_Images(camera, np.array([seen.view for seen in own], np.int64), uv))
+        uv, speed = np.full((len(own), corners, 2), np.nan), np.zeros((len(own), corners, 2))
+        for i, seen in enumerate(own):
+            uv[i, seen.corners] = seen.uv
+            if seen.speed is not None:
+                speed[i, seen.corners] = seen.speed
+        found.append(_Images(camera, np.array([seen.view for seen in own], np.int64), uv, speed))
     return found
 
 
@@ -195,7 +227,8 @@ def _jacobian(images: _Images, bundle: Bundle) -> tuple[Float, Float, Float, Flo
     in_rig = turned + T_rig_board[:, None, :3, 3]
     points, lens = transform(T_camera_rig, in_rig).reshape(-1, 3), bundle.lenses[images.camera]
     projected, derivatives = cv2.projectPoints(points, _ZERO, _ZERO, _matrix(lens), lens[4:])
-    off = np.asarray(projected, dtype=np.float64).reshape(images.uv.shape) - images.uv
+    seen = images.uv + images.speed * bundle.delay_s[images.camera]
+    off = np.asarray(projected, dtype=np.float64).reshape(seen.shape) - seen
     by_all = np.asarray(derivatives, dtype=np.float64).reshape(*off.shape, -1)
     by_point, by_lens = by_all[..., 3:6], by_all[..., 6:15]
     by_camera = np.concatenate([-by_point @ skew(in_rig @ rotation_c.T), by_point], axis=-1)
@@ -208,7 +241,7 @@ def _equations(
     images: Sequence[_Images], bundle: Bundle, mask: Bool, prior_px_m: float, cauchy_px: float | None
 ) -> Normal:
     """Normal equations [px] of the free unknowns, with the prior of the shape."""
-    cameras, shape_at = len(bundle.lenses), 15 * len(bundle.lenses)
+    cameras, shape_at = len(bundle.lenses), 16 * len(bundle.lenses)
     normal = Normal(len(mask), len(bundle.T_rig_board), 6)
     loss = None if cauchy_px is None else cauchy(cauchy_px)
     for own in images:
@@ -216,8 +249,9 @@ def _equations(
         if not np.isfinite(off[np.isfinite(own.uv)]).all():
             normal.cost = np.inf  # a board went through a camera: no such step
         c, (count, corners, _) = own.camera, off.shape
-        at = np.r_[9 * c : 9 * c + 9, 9 * cameras + 6 * c : 9 * cameras + 6 * c + 6]
-        by, rows = np.concatenate([by_lens, by_camera], axis=-1), (count, 2 * corners, -1)
+        at = np.r_[9 * c : 9 * c + 9, 9 * cameras + 6 * c : 9 * cameras + 6 * c + 6, 15 * cameras + c]
+        by = np.concatenate([by_lens, by_camera, -own.speed[..., None]], axis=-1)
+        rows = (count, 2 * corners, -1)
         flat = off.reshape(count, -1)
         normal.add(
             flat, by.reshape(rows), by_view.reshape(rows), epochs=own.views, columns=at, loss=loss, group=2
@@ -256,7 +290,8 @@ def _retracted(bundle: Bundle, shared: Float, own: Float) -> Bundle:
         lenses=bundle.lenses + shared[: 9 * cameras].reshape(cameras, 9),
         T_camera_rig=stepped_poses(bundle.T_camera_rig, places),
         T_rig_board=stepped_poses(bundle.T_rig_board, own),
-        shape_m=bundle.shape_m + shared[15 * cameras :].reshape(-1, 3),
+        delay_s=bundle.delay_s + shared[15 * cameras : 16 * cameras],
+        shape_m=bundle.shape_m + shared[16 * cameras :].reshape(-1, 3),
     )
 
 
@@ -267,7 +302,7 @@ def _solution(
     residuals = tuple(seen.uv - predict(bundle, seen) for seen in observations)
     numbers = 2 * sum(len(r) for r in residuals)
     # The prior takes the place of measurements for what the shape cannot learn: seven numbers of its frame and size.
-    spent = int(mask[: 15 * len(bundle.lenses)].sum()) + 6 * len(bundle.T_rig_board)
+    spent = int(mask[: 16 * len(bundle.lenses)].sum()) + 6 * len(bundle.T_rig_board)
     spent += 3 * len(bundle.drawn_m) - 7 if free.shape else 0
     sigma = float(np.sqrt(sum(float((r**2).sum()) for r in residuals) / max(numbers - spent, 1)))
     covariance = np.zeros((len(mask), len(mask)))

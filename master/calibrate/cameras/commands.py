@@ -18,10 +18,12 @@ from common.command_line import echo
 from common.errors import CalibrationError, FitError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import invert
-from master.calibrate.cameras.boards import board_in
+from master.calibrate.cameras.boards import Board, board_in
 from master.calibrate.cameras.coverage import draw_views
-from master.calibrate.cameras.fit import CamerasFit, fit_cameras
+from master.calibrate.cameras.fit import CamerasFit, fit_cameras, fit_tracks
 from master.calibrate.cameras.result import CamerasResult, report_json, report_lines, result
+from master.calibrate.cameras.timed_frames import streams_of
+from master.calibrate.cameras.tracks import Tracks, track
 from master.calibrate.cameras.views import BoardViews, View, image_sets, look
 from master.calibrate.tree_files import lens_of, matrix_of, print_lines, provenance, write_camera, write_rig
 from master.commands.summary import write_summary
@@ -97,9 +99,7 @@ def rig_with_places(
     # The rig's frame is wherever the file has it: there the first camera of both stays.
     anchor = next((camera for camera in known.cameras if camera in places), None)
     if anchor is None:
-        raise CalibrationError(
-            f"rig {name!r} has the cameras {', '.join(known.cameras)}, the images are of {', '.join(places)}"
-        )
+        raise CalibrationError(_other_rig(name, known.cameras, tuple(places)))
     T_rig_first = invert(_array(places[anchor]))
     if anchor in known.T_rig_camera:
         T_rig_first = known.camera_pose(anchor) @ T_rig_first
@@ -111,6 +111,13 @@ def rig_with_places(
         cameras=known.cameras + tuple(camera for camera in places if camera not in known.cameras),
         T_rig_camera=known.T_rig_camera | new,
         provenance=known.provenance | {"T_rig_camera": how},
+    )
+
+
+def _other_rig(name: str, cameras: tuple[str, ...], seen: tuple[str, ...]) -> str:
+    return (
+        f"rig {name!r} has the cameras {', '.join(cameras)}, the images are of {', '.join(seen)}:"
+        " give the name of another rig, or of a new one (--rig NAME)"
     )
 
 
@@ -186,7 +193,8 @@ def _array(matrix: Matrix4) -> Float:
 
 def intrinsics(options: Namespace) -> None:
     """Measure the lens of each camera by itself."""
-    views = _views(options)
+    seen = _seen(options)
+    views = seen if isinstance(seen, BoardViews) else seen.views(dict.fromkeys(seen.cameras, 0.0))
     known = _known_cameras(views, options.calibration, options.out)
     results: dict[str, CamerasResult] = {}
     for name in views.cameras:
@@ -209,7 +217,7 @@ def intrinsics(options: Namespace) -> None:
 def stereo(options: Namespace) -> None:
     """Calibrate poses and lenses of a rig's cameras, two or more, in one bundle."""
     rig_known = known_rig(options.rig, options.calibration, options.out)
-    views = _views(options)
+    views = _seen(options)
     if rig_known is not None:
         order = sorted(views.cameras, key=[*rig_known.cameras, *views.cameras].index)
         views = replace(views, sizes_px={name: views.sizes_px[name] for name in order})
@@ -217,12 +225,14 @@ def stereo(options: Namespace) -> None:
         raise FitError(
             f"stereo needs at least two cameras; there are images of {', '.join(views.cameras)} only"
         )
+    if options.out is not None and rig_known is not None and not set(rig_known.cameras) & set(views.cameras):
+        raise CalibrationError(_other_rig(options.rig, rig_known.cameras, views.cameras))
     known = _known_cameras(views, options.calibration, options.out)
     held: dict[str, Float] = {}
     for name, file in known.items():
         if options.keep_intrinsics and file is not None and file.intrinsics is not None:
             held[name] = lens_of(file.intrinsics)
-    fit = fit_cameras(views, held, bent=_bent(flat=options.flat_board, bent=options.bent_board))
+    fit = _fit(views, held, options)
     found = result(fit, held)
     print_lines(report_lines(found))
     _draw(options.picture, fit)
@@ -233,12 +243,14 @@ def stereo(options: Namespace) -> None:
         lens = found.lenses[name].intrinsics
         files[name] = camera_with_lens(known[name], name, views.sizes_px[name], lens, how)
     how = places_provenance(found, "calibrate cameras stereo", data)
-    new, dropped = without_wrong_law(
-        rig_with_places(rig_known, options.rig, dict(found.T_rig_camera), how), {**known, **files}
-    )
     if options.json_file is not None:
         write_summary(options.json_file, report_json(found) | {"rig": options.rig})
-    written = [] if options.out is None else write_files(options.out, files, {options.rig: new})
+    written, dropped = list[Path](), ""
+    if options.out is not None:
+        new, dropped = without_wrong_law(
+            rig_with_places(rig_known, options.rig, dict(found.T_rig_camera), how), {**known, **files}
+        )
+        written = write_files(options.out, files, {options.rig: new})
     if rig_known is None and written:
         echo(f"rig {options.rig!r} is new: its hand is 'default-right', its frame that of {views.cameras[0]}")
     if dropped and written:
@@ -253,6 +265,27 @@ def _bent(*, flat: bool, bent: bool) -> bool | None:
     return bent if flat or bent else None
 
 
+def _seen(options: Namespace) -> BoardViews | Tracks:
+    """What the cameras saw of the board, in frames with times or in pictures."""
+    board = board_in(options)
+    streams = streams_of(options.source, options.camera or (), echo)
+    if streams is None:
+        return _views(options)
+    tracks = track(board, streams, lambda text: echo(text, error=True))
+    _name_layout(tracks.board, board)
+    return tracks
+
+
+def _fit(seen: BoardViews | Tracks, held: Mapping[str, Float], options: Namespace) -> CamerasFit:
+    bent = _bent(flat=options.flat_board, bent=options.bent_board)
+    return (fit_cameras if isinstance(seen, BoardViews) else fit_tracks)(seen, held, bent=bent)  # pyright: ignore[reportArgumentType]
+
+
+def _name_layout(found: Board, asked: Board) -> None:
+    if found != asked:
+        echo(f"the pictures show a {found}")
+
+
 def _views(options: Namespace) -> BoardViews:
     board, sets = board_in(options), image_sets(options.source, options.camera or ())
     images = sum(len(own) for _, own in sets)
@@ -265,15 +298,14 @@ def _views(options: Namespace) -> BoardViews:
             echo(f"looking for the {board}: {done} of {images} images", error=True)
 
     views = look(board, sets, progress)
-    if views.board != board:
-        echo(f"the pictures show a {views.board}")
+    _name_layout(views.board, board)
     if views.unseen:
         echo(f"no board in {len(views.unseen)} of {images} images: {', '.join(views.unseen)}")
     return views
 
 
 def _known_cameras(
-    views: BoardViews, calibration: Path, out: Path | None
+    views: BoardViews | Tracks, calibration: Path, out: Path | None
 ) -> dict[str, CameraCalibration | None]:
     known = {name: known_camera(name, calibration, out) for name in views.cameras}
     for name, file in known.items():

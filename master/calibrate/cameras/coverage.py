@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.arrays import Bool, Float, Image
-from master.calibrate.cameras.boards import Board, ImageObservation, board_corners, find_board
+from master.calibrate.cameras.boards import Board, ImageObservation, board_corners
 from master.calibrate.cameras.bundle import guess_lens, place_board, rms
 from master.calibrate.cameras.fit import CamerasFit
 from master.calibrate.cameras.outliers import corners_seen
-from master.calibrate.cameras.views import BoardViews, View
+from master.calibrate.cameras.tracks import is_new
+from master.calibrate.cameras.views import BoardViews, Finder, View, moved_px
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -133,14 +134,19 @@ class LiveViews:
     """
 
     def __init__(self, board: Board, cameras: tuple[str, ...]) -> None:
-        self.board, self.cameras = board, cameras
+        self._finder, self.cameras = Finder(board), cameras
         self.views: list[View] = []
         self._sizes: dict[str, tuple[int, int]] = {}
         self._last: dict[str, ImageObservation] = {}
 
+    @property
+    def board(self) -> Board:
+        """The board, as it is printed once an image has shown it."""
+        return self._finder.board
+
     def push(self, images: Mapping[str, Image]) -> Verdict:
         """Judge the pictures (camera -> (H, W) or (H, W, 3)) of one round."""
-        found = {name: find_board(self.board, image) for name, image in images.items()}
+        found = {name: self._finder.find(image) for name, image in images.items()}
         seen = {name: observation for name, observation in found.items() if observation is not None}
         last, self._last = self._last, seen
         for name, image in images.items():
@@ -148,10 +154,10 @@ class LiveViews:
         if not seen:
             return Verdict(False, "no camera sees the board")
         by = " and ".join(seen)
-        moved = {name: _moved(seen[name], last[name]) if name in last else float("inf") for name in seen}
+        moved = {name: moved_px(seen[name], last[name]) if name in last else float("inf") for name in seen}
         if max(moved.values()) > 0.5:
             return Verdict(False, f"{by}: hold it still")
-        if not self._is_new(seen):
+        if not is_new(seen, self.views, self._sizes, 0.06):
             return Verdict(False, f"{by}: seen there already; move, turn or tilt it")
         self.views.append(View(f"{len(self.views) + 1:03d}", seen))
         return Verdict(True, by)
@@ -172,24 +178,6 @@ class LiveViews:
         if alone and len(self.cameras) > 1:
             return f"show the board to {alone[0]} and another camera at once"
         return "nothing is missing any more; more views make it more certain"
-
-    def _is_new(self, seen: Mapping[str, ImageObservation]) -> bool:
-        """Some camera sees the board as in no view before, or this set of cameras is new."""
-        for view in self.views:
-            if not set(seen) <= set(view.observations):
-                continue
-            pairs = ((name, now, view.observations[name]) for name, now in seen.items())
-            # Of the image's width: how far corners must be from where an earlier view had them.
-            if max(_moved(now, then) / self._sizes[name][0] for name, now, then in pairs) < 0.06:
-                return False
-        return True
-
-
-def _moved(now: ImageObservation, then: ImageObservation) -> float:
-    """Rms motion [px] of the corners seen both times; inf: there are none."""
-    step: Float = now.corners_px - then.corners_px
-    both = np.isfinite(step[:, 0])
-    return float(np.sqrt((step[both] ** 2).sum(axis=1).mean())) if both.any() else float("inf")
 
 
 _BLUE, _ORANGE, _GREY = "#2b6cb0", "#c2571a", "#8a8a8a"

@@ -5,7 +5,7 @@ with the board as drawn and with a shape of its own -> the one that predicts hel
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import cast
 
 import numpy as np
@@ -28,6 +28,7 @@ from master.calibrate.cameras.outliers import (
     judge,
     place_boards,
 )
+from master.calibrate.cameras.tracks import Tracks
 from master.calibrate.cameras.views import BoardViews
 
 Places = Mapping[str, Mapping[str, Float]]
@@ -140,6 +141,8 @@ class CamerasFit:
     free: Free  # what was estimated
     rejected: tuple[Rejection, ...]  # images that are not used, and views whose cameras do not agree
     board: BoardChoice  # whether the board's shape was estimated, and why
+    # camera -> by how much its times lag its exposures [s], against the first camera; empty: frames have no times
+    delay_s: Mapping[str, float] = field(default_factory=dict[str, float])
 
     @property
     def rms_px(self) -> float:
@@ -181,6 +184,7 @@ def fit_cameras(
         T_rig_board=np.zeros((0, 4, 4)),
         drawn_m=drawn,
         shape_m=np.zeros_like(drawn),
+        delay_s=np.zeros(len(views.cameras)),
     )
     if bent is not None:
         return _fit(seen, alone, start, held, BoardChoice(bent, reason="as asked for"))
@@ -196,6 +200,35 @@ def fit_cameras(
     both = [shot for shot in flat.shots if shot in shaped.shots]
     choice = choose(seen, both, _model(flat), _model(shaped))
     return replace(shaped if choice.bent else flat, board=choice)
+
+
+def fit_tracks(
+    tracks: Tracks, held: Mapping[str, Float] | None = None, *, bent: bool | None = None
+) -> CamerasFit:
+    """`fit_cameras` of cameras that took frames at their own times, with the lag of these.
+
+    Corners are carried to common instants anew until the lags change no more.
+
+    Raises:
+        FitError: As `fit_cameras`.
+    """
+    delay_s = dict.fromkeys(tracks.cameras, 0.0)
+    rounds, settled_s = 8, 1e-3
+    for _ in range(rounds):
+        fit = fit_cameras(tracks.views(delay_s), held, bent=False)
+        steps = fit.solution.bundle.delay_s
+        delay_s = {
+            name: delay_s[name] + float(step) for name, step in zip(tracks.cameras, steps, strict=True)
+        }
+        if np.abs(steps).max() < settled_s:
+            break
+    views = tracks.views(delay_s)
+    fit = fit_cameras(views, held, bent=bent)
+    steps = fit.solution.bundle.delay_s
+    return replace(
+        fit,
+        delay_s={name: delay_s[name] + float(step) for name, step in zip(tracks.cameras, steps, strict=True)},
+    )
 
 
 def _model(fit: CamerasFit) -> Model:
@@ -233,7 +266,9 @@ def _fit(
 def _free(views: BoardViews, held: Mapping[str, Float]) -> Free:
     """All but what is held, the first camera's pose, and k3."""
     lenses = np.array([[camera not in held and term < 8 for term in range(9)] for camera in views.cameras])
-    return Free(lenses, np.arange(len(views.cameras)) > 0, shape=False)
+    moving = [any(seen.speed_px_s is not None for _, seen in views.of(camera)) for camera in views.cameras]
+    others = np.arange(len(views.cameras)) > 0
+    return Free(lenses, others, shape=False, delays=others & np.array(moving))
 
 
 def _robust(

@@ -140,7 +140,8 @@ def _predicted(
 
 
 def _only(seen: Observation, which: Bool) -> Observation:
-    return replace(seen, corners=seen.corners[which], uv=seen.uv[which])
+    speed = None if seen.speed is None else seen.speed[which]
+    return replace(seen, corners=seen.corners[which], uv=seen.uv[which], speed=speed)
 
 
 def _odd(board: Board) -> Bool:

@@ -154,7 +154,13 @@ def _robust(
     observations = [Observation(0, view, *seen[i]) for view, i in enumerate(good)]
     places = np.stack([place_board(drawn[seen[i][0]], seen[i][1], lens)[0] for i in good])
     bundle = Bundle(
-        lens[None], centre_of(size_px)[None], np.eye(4)[None], places, drawn, np.zeros_like(drawn)
+        lens[None],
+        centre_of(size_px)[None],
+        np.eye(4)[None],
+        places,
+        drawn,
+        np.zeros_like(drawn),
+        np.zeros(1),
     )
     free = np.ones((1, 9), dtype=np.bool_)
     free[0, 8] = False
@@ -211,9 +217,11 @@ class Seen:
         by_name = {view.name: view for view in self.views.views}
         found: list[Observation] = []
         for shot in shots:
-            corners, uv = corners_seen(by_name[shot.view].observations[shot.camera])
+            image = by_name[shot.view].observations[shot.camera]
+            corners, uv = corners_seen(image)
             true = self.corner_order[shot.view][shot.camera][corners]
-            found.append(Observation(cameras.index(shot.camera), number[shot.place], true, uv))
+            speed = None if image.speed_px_s is None else image.speed_px_s[corners]
+            found.append(Observation(cameras.index(shot.camera), number[shot.place], true, uv, speed))
         return tuple(found)
 
 

@@ -141,6 +141,8 @@ class CamerasResult:
     pairs: tuple[PairAudit, ...]
     views: int  # number of views that cameras share; one camera: of all
     rejected: tuple[Rejection, ...]  # what was excluded, and why
+    # camera -> lag of its times against the first camera's and its standard deviation [s]; empty: no times
+    delay_s: Mapping[str, tuple[float, float]]
 
 
 def result(fit: CamerasFit, held: Mapping[str, Float]) -> CamerasResult:
@@ -182,6 +184,11 @@ def result(fit: CamerasFit, held: Mapping[str, Float]) -> CamerasResult:
         pairs=pairs,
         views=len(shared) if len(names) > 1 else len(fit.shots),
         rejected=fit.rejected,
+        delay_s={
+            name: (fit.delay_s[name], fit.solution.delay_sd(i))
+            for i, name in enumerate(names)
+            if i and fit.delay_s
+        },
     )
 
 
@@ -210,14 +217,16 @@ def _lens(fit: CamerasFit, index: int, estimated: bool) -> LensResult:
     return LensResult(intrinsics_of(lens), sd, error, len(own), covered, estimated)
 
 
+_MOST_FOCAL_SD, _GOOD_FOCAL_SD = 0.03, 0.01  # of the focal length, and so of every depth
+
+
 def _check_determined(camera: str, focal_sd: float, covered: Coverage, views: int) -> None:
-    most_focal_sd = 0.01  # of the focal length: one percent of every depth
     least_tilt_deg = 10.0
-    if covered.tilt_spread_deg < least_tilt_deg or not focal_sd <= most_focal_sd:
+    if covered.tilt_spread_deg < least_tilt_deg or not focal_sd <= _MOST_FOCAL_SD:
         advised = advice(covered)
         raise FitError(
             f"camera {camera!r}: the focal length is not determined (standard deviation"
-            f" {min(100 * focal_sd, 999):.2g} %, at most {100 * most_focal_sd:g} %): the board's tilts lie within"
+            f" {min(100 * focal_sd, 999):.2g} %, at most {100 * _MOST_FOCAL_SD:g} %): the board's tilts lie within"
             f" {covered.tilt_spread_deg:.0f}° of each other, in {views} views{'; ' * bool(advised)}{advised}"
         )
 
@@ -262,6 +271,12 @@ def report_lines(result: CamerasResult) -> Iterator[str]:
         yield (
             f"  squares triangulated from the written values: {pair.edge_mean_mm:.3f} ± {pair.edge_sd_mm:.3f} mm"
             f" (mean, standard deviation of {pair.edges} sides; worst off by {pair.edge_worst_mm:.2f} mm)"
+        )
+    for name, (delay_s, sd_s) in result.delay_s.items():
+        late = "after" if delay_s > 0.0 else "before"
+        yield (
+            f"{name}: its times are {1e3 * abs(delay_s):.1f} ± {1e3 * sd_s:.1f} ms {late} its exposures, counted from"
+            f" those of {next(iter(result.lenses))}: taken into account"
         )
     what = "stereo rms" if len(result.lenses) > 1 else "rms"
     yield f"{what} {result.rms_px:.3f} px over {result.views} views"
@@ -310,6 +325,8 @@ def _lens_lines(name: str, lens: LensResult) -> Iterator[str]:
     little = 0.25  # of the image
     if lens.estimated and covered.share < little:
         yield "  beyond these corners the distortion is that of an ordinary lens, no surer than its ± says"
+    if lens.estimated and lens.sd[0] > _GOOD_FOCAL_SD * values[0]:
+        yield f"  the focal length is known to {100 * lens.sd[0] / values[0]:.1f} % only, and so is every depth"
     if advised := advice(covered):
         yield f"  it would gain most if you {advised}"
 
@@ -325,6 +342,7 @@ def report_json(result: CamerasResult) -> dict[str, object]:
             name: {"centre_m": sd[:3].tolist(), "rotation_rad": sd[3:].tolist()}
             for name, sd in result.place_sd.items()
         },
+        "delay_s": {name: {"delay_s": delay, "sd_s": sd} for name, (delay, sd) in result.delay_s.items()},
         "pairs": [_pair_json(pair) for pair in result.pairs],
         "board": _board_json(result),
         "rejected": [{"view": no.view, "camera": no.camera, "reason": no.reason} for no in result.rejected],

@@ -66,8 +66,7 @@ def look(
     sizes: dict[str, tuple[int, int]] = {}
     views: list[View] = []
     unseen: list[str] = []
-    first: list[Image] = []
-    board = _as_printed(board, sets)
+    finder = Finder(board)
     for name, images in sets:
         observations: dict[str, ImageObservation] = {}
         for camera, load in images.items():
@@ -78,10 +77,8 @@ def look(
                     f"camera {camera!r}: view {name} is {size[0]} x {size[1]} px, the views before it"
                     f" {sizes[camera][0]} x {sizes[camera][1]}: take all images of a camera in one mode"
                 )
-            if (observation := find_board(board, image)) is None:
+            if (observation := finder.find(image)) is None:
                 unseen.append(f"{name} {camera}")
-                if len(first) < 4:
-                    first.append(image)
             else:
                 observations[camera] = observation
             progress(f"{name} {camera}")
@@ -90,34 +87,55 @@ def look(
     if not sizes:
         raise FitError("there is no image")
     if not views:
-        raise FitError(f"no {board} in any of {len(unseen)} images: {_advice(board, first)}")
-    return BoardViews(board, sizes, tuple(views), tuple(unseen))
+        raise FitError(f"no {board} in any of {len(unseen)} images: {finder.advice()}")
+    return BoardViews(finder.board, sizes, tuple(views), tuple(unseen))
 
 
-def _as_printed(board: Board, sets: Sequence[tuple[str, ImageSet]]) -> Board:
-    """The board in the layout that some images show; as given where none shows it."""
-    if not isinstance(board, Charuco):
-        return board
-    loads = [load for _, images in sets for load in images.values()]
-    tried = 12  # images, spread over all
-    images: list[Image] = []
-    for i in np.unique(np.linspace(0, max(len(loads) - 1, 0), min(tried, len(loads))).astype(np.int64)):
-        images.append(loads[int(i)]())
-        if find_board(board, images[-1]) is not None:
-            return board
-    found = (other for other in board.layouts() if any(find_board(other, image) for image in images))
-    return next(found, board)
+class Finder:
+    """Finds a board in images; of a ChArUco board the layout in which one shows it.
+
+    State: the board as it is printed, once an image has shown it, and some images without it.
+    """
+
+    def __init__(self, board: Board) -> None:
+        self.board = board
+        self._known = not isinstance(board, Charuco)
+        self._unseen, self._without = 0, list[Image]()
+
+    def find(self, image: Image) -> ImageObservation | None:
+        """The board in an image (H, W) or (H, W, 3) BGR; None: not found."""
+        found = find_board(self.board, image)
+        often, seldom = 12, 4  # images that are searched for all layouts; then every so many
+        if found is None and not self._known and (self._unseen < often or self._unseen % seldom == 0):
+            for other in self.board.layouts() if isinstance(self.board, Charuco) else ():
+                if (found := find_board(other, image)) is not None:
+                    self.board = other
+                    break
+        if found is not None:
+            self._known = True
+            return found
+        self._unseen += 1
+        if self._unseen & (self._unseen - 1) == 0:  # 1, 2, 4, ...: early ones may show nothing
+            self._without = [*self._without, image][-4:]
+        return None
+
+    def advice(self) -> str:
+        """What to do about a board that was found in no image."""
+        for other in _likely_mistakes(self.board):
+            if any(find_board(other, image) is not None for image in self._without):
+                return f"they show a {other}"
+        if isinstance(self.board, Checkerboard):
+            return (
+                "count the inner corners (squares less one), show all with a white margin, well lit and sharp"
+            )
+        return "check columns, rows, sizes and dictionary against what is printed on the board, light and sharpness"
 
 
-def _advice(board: Board, images: list[Image]) -> str:
-    for other in _likely_mistakes(board):
-        if any(find_board(other, image) is not None for image in images):
-            return f"they show a {other}"
-    if isinstance(board, Checkerboard):
-        return "count the inner corners (squares less one), show all of them with a white margin, well lit and sharp"
-    return (
-        "check columns, rows, sizes and dictionary against what is printed on the board, light and sharpness"
-    )
+def moved_px(now: ImageObservation, then: ImageObservation) -> float:
+    """Rms motion [px] of the corners seen both times; inf: there are none."""
+    step = now.corners_px - then.corners_px
+    both = np.isfinite(step[:, 0])
+    return float(np.sqrt((step[both] ** 2).sum(axis=1).mean())) if both.any() else float("inf")
 
 
 def _likely_mistakes(board: Board) -> Iterator[Board]:
@@ -207,14 +225,14 @@ def _by_prefix(folder: Path, files: list[Path], cameras: Sequence[str]) -> dict[
 
 
 def _matched(folder: Path, files: dict[str, dict[str, Path]]) -> list[tuple[str, ImageSet]]:
-    names = sorted(set[str]().union(*files.values()), key=_natural)
+    names = sorted(set[str]().union(*files.values()), key=natural)
     return [
         (name, {camera: partial(load_image, own[name]) for camera, own in files.items() if name in own})
         for name in names
     ]
 
 
-def _natural(name: str) -> tuple[tuple[int, str], ...]:
+def natural(name: str) -> tuple[tuple[int, str], ...]:
     """Order in which 2 comes before 10."""
     return tuple(
         (int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name) if part

@@ -38,13 +38,14 @@ def _problem(truth: Scene, noise_px: float, seed: int) -> tuple[list[Observation
         truth.T_rig_board,
         drawn,
         truth.shape_m.copy(),
+        np.zeros(len(truth.lenses)),
     )
     cameras, views = len(truth.lenses), len(truth.T_rig_board)
     shared = np.concatenate(
         [
             (rng.normal(size=(cameras, 9)) * ([3, 3, 3, 3, 0.01, 0.01, 1e-4, 1e-4, 0.01])).ravel(),
             rng.normal(0.0, 1e-3, (cameras, 6)).ravel(),
-            np.zeros(3 * len(drawn)),
+            np.zeros(cameras + 3 * len(drawn)),
         ]
     )
     shared[9 * cameras : 9 * cameras + 6] = 0.0
@@ -67,18 +68,18 @@ def test_derivatives_are_those_of_the_prediction() -> None:
         *((18 + 6 + i, by_camera[:, :, i], 1e-6) for i in range(6)),
     ]
     for at, expected, step in cases:
-        shared = np.zeros(30 + 3 * corners)
+        shared = np.zeros(32 + 3 * corners)
         shared[at] = step
         up, down = (predict(_retracted(bundle, sign * shared, np.zeros((2, 6))), seen) for sign in (1, -1))
         np.testing.assert_allclose((up - down) / (2 * step), expected, rtol=1e-4, atol=1e-3)
     for i in range(6):
         own = np.zeros((2, 6))
         own[1, i] = 1e-6
-        up, down = (predict(_retracted(bundle, np.zeros(30 + 3 * corners), s * own), seen) for s in (1, -1))
+        up, down = (predict(_retracted(bundle, np.zeros(32 + 3 * corners), s * own), seen) for s in (1, -1))
         np.testing.assert_allclose((up - down) / 2e-6, by_view[:, :, i], rtol=1e-4, atol=1e-3)
     for i in range(3):
-        shared = np.zeros(30 + 3 * corners)
-        shared[30 + 3 * 7 + i] = 1e-6
+        shared = np.zeros(32 + 3 * corners)
+        shared[32 + 3 * 7 + i] = 1e-6
         up, down = (predict(_retracted(bundle, s * shared, np.zeros((2, 6))), seen) for s in (1, -1))
         change = (up - down) / 2e-6
         np.testing.assert_allclose(change[7], by_shape[7, :, i], rtol=1e-4, atol=1e-3)
