@@ -47,7 +47,7 @@ class Bundle:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Free:
-    """What is estimated of lenses (C, 9), poses and delays (C,) and the board's shape.
+    """What is estimated of lenses (C, 9), cameras (C,) and the board's shape.
 
     Poses of the board always are.
     """
@@ -259,7 +259,7 @@ def _equations(
         if prior_px_m > 0.0:  # a corner's offset moves that corner alone: its rows are blocks
             weight = weigh(flat, loss, 2)[1].reshape(off.shape)[..., None] ** 2
             heavy = np.where(weight > 0.0, by_shape * weight, 0.0)
-            places = shape_at + np.arange(3 * corners).reshape(corners, 3)
+            places: Int = shape_at + np.arange(3 * corners, dtype=np.int64).reshape(corners, 3)
             blocks = _einsum("enri,enrj->nij", heavy, by_shape)
             cross = _einsum("enra,enrj->anj", by, heavy).reshape(len(at), -1)
             normal.shared[places[:, :, None], places[:, None, :]] += blocks

@@ -22,8 +22,7 @@ from master.calibrate.cameras.boards import Board, board_in
 from master.calibrate.cameras.coverage import draw_views
 from master.calibrate.cameras.fit import CamerasFit, fit_cameras, fit_tracks
 from master.calibrate.cameras.result import CamerasResult, report_json, report_lines, result
-from master.calibrate.cameras.timed_frames import streams_of
-from master.calibrate.cameras.tracks import Tracks, track
+from master.calibrate.cameras.tracks import Tracks, streams_of, track
 from master.calibrate.cameras.views import BoardViews, View, image_sets, look
 from master.calibrate.tree_files import lens_of, matrix_of, print_lines, provenance, write_camera, write_rig
 from master.commands.summary import write_summary

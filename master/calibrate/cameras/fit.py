@@ -15,15 +15,17 @@ from common.errors import FitError
 from common.geometry.transforms import fit_rigid, invert, transform
 from master.calibrate.cameras.boards import Board, board_corners, orderings
 from master.calibrate.cameras.bundle import Bundle, Free, Observation, Solution, predict, rms, solve
-from master.calibrate.cameras.held_out import MIN_VIEWS as MIN_SHAPE_VIEWS
-from master.calibrate.cameras.held_out import BoardChoice, Model, choose
 from master.calibrate.cameras.outliers import (
+    MIN_SHAPE_VIEWS,
     MIN_VIEWS,
     Alone,
+    BoardChoice,
+    Model,
     Rejection,
     Seen,
     Shot,
     centre_of,
+    choose,
     fit_alone,
     judge,
     place_boards,

@@ -19,8 +19,7 @@ from master.calibrate.cameras.boards import Board, grid_edges
 from master.calibrate.cameras.bundle import LENS, rms
 from master.calibrate.cameras.coverage import Coverage, advice, coverage
 from master.calibrate.cameras.fit import CamerasFit
-from master.calibrate.cameras.held_out import BoardChoice
-from master.calibrate.cameras.outliers import Rejection
+from master.calibrate.cameras.outliers import BoardChoice, Rejection
 from master.calibrate.tree_files import camera_model, intrinsics_of, lens_of, matrix_of
 
 
