@@ -317,6 +317,13 @@ def _determined(solution: Solution, lenses: Bool) -> Bool:
     """The free terms (C, 9) without the next insignificant one of each camera."""
     kept = lenses.copy()
     for camera, lens in enumerate(solution.bundle.lenses):
+        if (higher := [term for term in (8, 5) if kept[camera, term]]) and _folds(
+            lens, solution.bundle.centre_px[camera]
+        ):
+            kept[camera, higher[0]] = (
+                False  # what folds the lens before the corner of the image is not known there
+            )
+            continue
         for term in _TERMS:
             index = list(term)
             if not kept[camera, index].any():
@@ -332,6 +339,14 @@ def _determined(solution: Solution, lenses: Bool) -> Bool:
             if term != _TANGENTIAL and not kept[camera, _TANGENTIAL[0]]:
                 break  # a radial term that is needed needs those before it
     return kept
+
+
+def _folds(lens: Float, centre_px: Float) -> bool:
+    """Whether the distortion of a lens turns back inside the image."""
+    r2 = np.linspace(0.0, 1.0, 50) * float(
+        (((centre_px + np.abs(lens[2:4] - centre_px)) / lens[:2]) ** 2).sum()
+    )
+    return bool((1.0 + 3.0 * lens[4] * r2 + 5.0 * lens[5] * r2**2 + 7.0 * lens[8] * r2**3).min() <= 0.0)
 
 
 def _check_enough(

@@ -121,7 +121,9 @@ class Finder:
 
     def advice(self) -> str:
         """What to do about a board that was found in no image."""
-        for other in _likely_mistakes(self.board):
+        likely = list(_likely_mistakes(self.board))
+        likely += [other for board in likely if isinstance(board, Charuco) for other in board.layouts()]
+        for other in likely:
             if any(find_board(other, image) is not None for image in self._without):
                 return f"they show a {other}"
         if isinstance(self.board, Checkerboard):
