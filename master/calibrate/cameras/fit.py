@@ -207,7 +207,7 @@ def fit_cameras(
 def fit_tracks(
     tracks: Tracks, held: Mapping[str, Float] | None = None, *, bent: bool | None = None
 ) -> CamerasFit:
-    """`fit_cameras` of cameras that took frames at their own times, with the lag of these.
+    """`fit_cameras` of cameras with times of their own, and the lag of these.
 
     Corners are carried to common instants anew until the lags change no more.
 

@@ -103,7 +103,7 @@ class Tracks:
         return tuple(self.sizes_px)
 
     def views(self, delay_s: Mapping[str, float]) -> BoardViews:
-        """Views of instants spread over all places of the board, the stillest of each.
+        """Views of instants in all places of the board, the stillest of each.
 
         `delay_s`: by how much each camera's times lag its exposures.
         """
@@ -148,7 +148,7 @@ def is_new(
 
 
 def track(board: Board, streams: Mapping[str, Stream], progress: Callable[[str], None]) -> Tracks:
-    """Find the board in frames of all cameras, of long streams in bursts spread over all.
+    """Find the board in frames of all cameras, of long streams in bursts.
 
     Raises:
         FitError: The board is in none of the frames, or no frame of a camera can be decoded.
@@ -179,7 +179,7 @@ def track(board: Board, streams: Mapping[str, Stream], progress: Callable[[str],
 
 
 def _wanted(t_s: Float) -> "np.ndarray[tuple[int], np.dtype[np.int64]]":
-    """Indices of at most 600 frames: thinned to 15 a second, then in bursts of a second."""
+    """Indices of at most 600 frames: 15 a second, of more in bursts of a second."""
     fastest_hz, most, burst = 15.0, 600, 15
     step = max(int(1.0 / fastest_hz / max(float(np.median(np.diff(t_s))), 1e-6) + 0.01), 1)
     thinned = np.arange(0, len(t_s), step)
@@ -198,7 +198,7 @@ COLUMNS = "cam_id or camera; frame_time or t_s (seconds), or t_ns; and, if you l
 def streams_of(
     folder: Path, cameras: Sequence[str], notify: Callable[[str], None]
 ) -> dict[str, Stream] | None:
-    """Videos of a folder, or its folders of pictures with a table of times; None: it has neither.
+    """Videos of a folder, or pictures with a table of times; None: it has neither.
 
     Args:
         cameras: Those wanted; none: all.
@@ -229,7 +229,7 @@ def streams_of(
 
 
 def _videos_in(folder: Path) -> dict[str, Path]:
-    """Camera -> its video: in the folder, by name, or one alone in a folder that is named as the camera."""
+    """Camera -> its video: named as the camera, or alone in a folder that is."""
     found = {file.stem: file for file in _files(folder, VIDEOS)}
     for sub in sorted(folder.iterdir()) if not found else ():
         own = _files(sub, VIDEOS) if sub.is_dir() else []
