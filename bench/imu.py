@@ -2,7 +2,7 @@
 
 All recordings of BROAD (D. Laidig et al. 2021, CC BY 4.0) in the folder `broad` of PHALANX_DATASETS, with optical
 truth; only what moves is scored. Inclination is the angle between true and found vertical;
-95 % of it should lie within the stated sigmas. A heading begins anywhere: its drift is the slope of its error.
+95 % of it should lie within the stated sigmas.
 """
 
 import importlib
@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.report import Row, datasets, rms, skipped
+from bench.report import Row, datasets, skipped
 from common.arrays import Bool, Float
-from common.geometry.transforms import quaternion_to_matrix
 from common.imu.fusion import OrientationFilter, TiltErrors
 from common.messages import ImuSample
 
@@ -45,38 +44,6 @@ class Recording:
             for k in range(len(gyro))
         ]
         return cls(samples, rate_hz, truth, moving & np.isfinite(truth).all(axis=1))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Errors:
-    """Of what moved: inclination [deg] (T,), heading [deg] (T,) against its first moment, and time [s] (T,)."""
-
-    inclination_deg: Float
-    heading_deg: Float
-    t_s: Float
-
-    @classmethod
-    def of(cls, found_wxyz: Float, recording: Recording) -> "Errors":
-        """Of orientations (T, 4); NaN, one not known, is not scored."""
-        rows = np.flatnonzero(recording.moving & np.isfinite(found_wxyz).all(axis=1))
-        found, truth = (quaternion_to_matrix(q[rows]) for q in (found_wxyz, recording.truth_wxyz))
-        off = found @ np.swapaxes(truth, 1, 2)
-        heading = np.unwrap(np.arctan2(off[:, 1, 0] - off[:, 0, 1], off[:, 0, 0] + off[:, 1, 1]))
-        t_s = np.array([recording.samples[row].t_ns for row in rows]) * 1e-9
-        return cls(
-            np.degrees(np.arccos(np.clip(off[:, 2, 2], -1.0, 1.0))), np.degrees(heading - heading[0]), t_s
-        )
-
-    @property
-    def inclination_rms_deg(self) -> float:
-        """Root mean square."""
-        return rms(self.inclination_deg)
-
-    @property
-    def drift_deg_per_min(self) -> float:
-        """Slope of the heading's error."""
-        t = self.t_s - self.t_s.mean()
-        return 60.0 * float(t @ self.heading_deg / (t @ t))
 
 
 def stated(recording: Recording) -> tuple[Float, Float]:
@@ -116,21 +83,10 @@ def _recorded(what: str, recording: Recording) -> Row:
     tilt = tilt_errors(found, sigma_rad, recording)
     against = "VQF is not installed"
     if (other := vqf(recording.rate_hz)) is not None:
-        theirs_deg = Errors.of(played(other, recording), recording).inclination_rms_deg
+        theirs_deg = tilt_errors(played(other, recording), np.zeros(len(found)), recording).rms_deg
         against = f"{tilt.rms_deg / theirs_deg:.2f} of VQF's {theirs_deg:.2f}"
     stated_text = f"stated {tilt.stated_deg:.2f}, {100 * tilt.within:.0f} % within 95 %"
     return Row(f"{what}: inclination", tilt.rms_deg, "deg rms", f"{against}; {stated_text}")
-
-
-def forces_alone(rate_hz: float) -> Push:
-    """Where the force of every sample points is up; no heading at all."""
-
-    def level(sample: ImuSample) -> Float:
-        x, y, z = (sample.accel_m_s2 / np.linalg.norm(sample.accel_m_s2)).tolist()
-        q = np.array([1.0 + z, y, -x, 0.0])  # the shortest turn that brings the force up
-        return q / np.linalg.norm(q)
-
-    return level
 
 
 def vqf(rate_hz: float) -> Push | None:

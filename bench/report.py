@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
@@ -26,7 +24,6 @@ Arrays = TypeVar("Arrays", bound="DataclassInstance")
 ROOT = Path(__file__).resolve().parents[1]
 CALIBRATION = ROOT / "calib_json"
 REGION = 7.815  # 95 % quantile of chi square with three degrees of freedom
-COLOURS = ("#14507a", "#b0473a", "#e0a030", "#3f8f5b", "#7a5ca8")  # of lines in pictures
 
 
 class Row(NamedTuple):
@@ -90,13 +87,6 @@ def write_json(file: Path, tables: Mapping[str, Sequence[Row]]) -> None:
 
     found = {name: [plain(row) for row in rows] for name, rows in tables.items()}
     file.write_text(json.dumps(found, indent=1, allow_nan=False))
-
-
-def figure(width: float, height: float) -> Figure:
-    """Return an empty figure of this size [inch] that needs no screen."""
-    made = Figure(figsize=(width, height), dpi=110, layout="constrained")
-    FigureCanvasAgg(made)
-    return made
 
 
 def rms(values: Float | Sequence[float]) -> float:

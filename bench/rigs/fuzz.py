@@ -222,16 +222,6 @@ def _structs(kind: inspect.StructType, base: dict[str, object], source: random.R
 
 Fields: TypeAlias = dict[str, object]
 MESSAGE_TYPES: tuple[type[Struct], ...] = (*get_args(AnyMessage), Hello, Started, EchoAnswer)  # of a slave
-_ZERO: Mapping[type, object] = {
-    inspect.IntType: 1,
-    inspect.FloatType: 1.0,
-    inspect.BoolType: False,
-    inspect.StrType: "name",
-    inspect.BytesType: bytes(16),
-    inspect.CustomType: bytes(8),
-    inspect.DictType: {"name": 1},
-    inspect.NoneType: None,
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,30 +269,6 @@ def wire(message: Struct) -> Fields:
             msgspec.to_builtins(value, builtin_types=(bytes,)) if plain else value.astype(dtype).tobytes()
         )
     return out
-
-
-def plausible(kind: type[Struct]) -> Fields:
-    """A message of this type, each field with the simplest value, for types of which no example is known."""
-    info = inspect.type_info(kind)
-    assert isinstance(info, inspect.StructType)
-    out: Fields = {} if info.tag is None else {"type": info.tag}
-    return out | {one.encode_name: _simplest(one.type) for one in info.fields}
-
-
-def _simplest(kind: inspect.Type) -> object:
-    if isinstance(kind, inspect.StructType):
-        return plausible(kind.cls)
-    if isinstance(kind, inspect.LiteralType):
-        return kind.values[0]
-    if isinstance(kind, inspect.VarTupleType | inspect.ListType):
-        return [_simplest(kind.item_type)]
-    if isinstance(kind, inspect.Metadata):
-        return _simplest(kind.type)
-    if isinstance(kind, inspect.UnionType):
-        return _simplest(kind.types[0])
-    if type(kind) not in _ZERO:
-        raise TypeError(f"{kind}: nothing plausible is known for this type; add it to {__name__}")
-    return _ZERO[type(kind)]
 
 
 def attacks(kind: type[Struct], base: Mapping[str, object], source: random.Random) -> Iterator[Attack]:
@@ -373,7 +339,7 @@ def all_attacks(
     """Of each type all attacks, those of one message and those over time."""
     out: dict[type[Struct], list[list[Attack]]] = {}
     for kind in kinds:
-        base = bases.get(kind) or plausible(kind)
+        base = bases[kind]
         out[kind] = [[one] for one in attacks(kind, base, source)] + list(over_time(kind, base))
     return out
 
@@ -389,7 +355,7 @@ def flood(shares: Mapping[type[Struct], float], bases: Bases, count: int, seed: 
     source = random.Random(seed)
     kinds = list(shares)
     known = all_attacks(kinds, bases, source)
-    single = {kind: list(_fields(kind, bases.get(kind) or plausible(kind), source)) for kind in kinds}
+    single = {kind: list(_fields(kind, bases[kind], source)) for kind in kinds}
     weights = [shares[kind] for kind in kinds]
     sent = 0
     while sent < count:

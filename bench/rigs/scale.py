@@ -23,7 +23,7 @@ from typing import cast
 import numpy as np
 
 from bench.report import CALIBRATION, machine
-from bench.rigs.local import UP_S, Rig, RigError, cpu_s, free_port, join_bus, losses, until
+from bench.rigs.local import UP_S, Rig, free_port, join_bus, losses, until
 from bench.rigs.rooms import DESK, ROOM, detections, in_order, room, slower
 from common.bus.bus import Subscription
 from common.bus.keys import access_of
@@ -175,9 +175,7 @@ class ScaleRun:
     latency_p50_ms: float  # from the sending of the last frame of a pose to its publication
     latency_p99_ms: float
     cores: float  # processor time of all masters together, seconds a second
-    threads: dict[str, float]  # the same by thread of a master: `solve`, `ingest`, `bus`, `others`
     pose_bytes: float  # of a pose on the bus, with all of its fields
-    sender_late_p99_ms: float  # by how much the simulated cameras were late themselves
     load: float  # load average of the machine at the end
 
 
@@ -219,14 +217,12 @@ def measure(folder: Path, layout: str, cameras: int, rate_hz: float, seconds: fl
             place = [str(tree), name, str(rate_hz), str(rig.beacon_port), str(epoch_ns)]
             rig.start("cameras", "bench.rigs.sender", *place, ready="sending")
         time.sleep(3.0)  # all settles
-        before, cpu, began = _sums(rigs), _threads(rigs), time.monotonic()
+        before, spent_before_s, began = _sums(rigs), _spent_s(rigs), time.monotonic()
         for one in received:
             one.latency_ms.clear()
         time.sleep(seconds)
-        took, after, spent = time.monotonic() - began, _sums(rigs), _threads(rigs)
+        took, after, spent_s = time.monotonic() - began, _sums(rigs), _spent_s(rigs)
         latencies_ms, load = [list(one.latency_ms) for one in received], os.getloadavg()[0]
-        late_ms = [_late_p99_ms(rig) for rig in rigs]
-    threads = {one: (spent[one] - cpu[one]) / took for one in spent}
     latencies = [np.percentile(one, [50, 99]) for one in latencies_ms if one] or [np.array([nan, nan])]
     p50, p99 = np.median(latencies, axis=0)
     return ScaleRun(
@@ -239,23 +235,11 @@ def measure(folder: Path, layout: str, cameras: int, rate_hz: float, seconds: fl
         poses_hz=median(len(one) for one in latencies_ms) / took,
         latency_p50_ms=float(p50),
         latency_p99_ms=float(p99),
-        cores=sum(threads.values()),
-        threads=threads,
+        cores=(spent_s - spent_before_s) / took,
         pose_bytes=median(one.pose_bytes for one in received),
-        sender_late_p99_ms=max(late_ms),
         load=load,
         **{one: after[one] - before[one] for one in after},
     )
-
-
-def _late_p99_ms(rig: Rig) -> float:
-    """End its cameras; return by how much they were late."""
-    process = rig.processes["cameras"]
-    assert process.stdin is not None
-    process.stdin.close()
-    if not until(lambda: process.poll() is not None, UP_S):
-        raise RigError("the simulated cameras do not end")
-    return float(json.loads((rig.folder / "cameras.log").read_text().splitlines()[-1])["late_p99_ms"])
 
 
 def _sums(rigs: Sequence[Rig]) -> dict[str, int]:
@@ -269,27 +253,9 @@ def _sums(rigs: Sequence[Rig]) -> dict[str, int]:
     return out
 
 
-def _threads(rigs: Sequence[Rig]) -> dict[str, float]:
-    """Return the processor time of all masters by thread since they began [s].
-
-    Python's threads have the name of the process, those of the bus names of their own. Of the former the main one
-    solves and publishes; the busiest other one is that of ingest.
-    """
-    out: dict[str, float] = dict.fromkeys(("solve", "ingest", "bus", "others"), 0.0)
-    for pid in (rig.processes[MASTER].pid for rig in rigs):
-        own: list[float] = []
-        for task in Path(f"/proc/{pid}/task").iterdir():
-            spent_s = cpu_s(pid, f"task/{task.name}")
-            if task.name == str(pid):
-                out["solve"] += spent_s
-            elif re.match(r"python|phalanx", (task / "comm").read_text()):
-                own.append(spent_s)
-            else:
-                out["bus"] += spent_s
-        own.sort()
-        out["ingest"] += own[-1] if own else 0.0
-        out["others"] += sum(own[:-1])
-    return out
+def _spent_s(rigs: Sequence[Rig]) -> float:
+    """Return the processor time of all masters since they began [s]."""
+    return sum(rig.footprint().cpu_s for rig in rigs)
 
 
 def solve_us(cameras: int, rate_hz: float) -> dict[str, float]:

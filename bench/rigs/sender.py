@@ -2,15 +2,14 @@
 
 `python -m bench.rigs.sender TREE RIG RATE_HZ BEACON_PORT EPOCH_NS [--cameras NAME ...] [--way] [--clock-s OFFSET]
 [--wire VERSION]`, the rig key in PHALANX_RIG_KEY. It prints `ready` when it listens, `sending` when all cameras have
-the start, and at the end how late it was, as JSON. `step SECONDS` on standard input steps its clock; the end of it ends
-the process. It costs little, so that the master or the link is measured and not a machine too slow to draw.
+the start. `step SECONDS` on standard input steps its clock; the end of it ends the process. It costs little, so that
+the master or the link is measured and not a machine too slow to draw.
 
 Cameras that share a processor would share one thread each with Python's lock: one loop sends for all, in the order of
 their times. Frames that were not sent in time are gone, as a camera's are that nobody reads.
 """
 
 import argparse
-import json
 import logging
 import os
 import sys
@@ -21,7 +20,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
-import numpy as np
 
 import common.link.datagram
 from bench.rigs.rooms import LOOP_S, detections
@@ -56,9 +54,9 @@ class Camera:
         return epoch_ns + loop * self.loop_ns + self.frames[k].t_ns
 
 
-def send(cameras: Sequence[Camera], clock: SkewedClock, epoch_ns: int, stop: threading.Event) -> list[float]:
-    """Send each frame when it is due, until `stop`; return by how much each was late [s]."""
-    true, late_s = SystemClock(), list[float]()
+def send(cameras: Sequence[Camera], clock: SkewedClock, epoch_ns: int, stop: threading.Event) -> None:
+    """Send each frame when it is due, until `stop`."""
+    true = SystemClock()
     for one in cameras:
         period_ns = one.loop_ns / len(one.frames)
         one.seq = max(0, round((true.now_ns() + 0.05e9 - epoch_ns) / period_ns))
@@ -71,12 +69,10 @@ def send(cameras: Sequence[Camera], clock: SkewedClock, epoch_ns: int, stop: thr
             continue
         while (left_ns := due_ns - true.now_ns()) > 0:
             time.sleep(left_ns * 1e-9)
-        late_s.append(-left_ns * 1e-9)
         times = {"t_ns": clock.from_true(due_ns), "ready_t_ns": clock.now_ns()}
         frame, session = camera.frames[camera.seq % len(camera.frames)], camera.uplink.session
         camera.uplink.send(msgspec.structs.replace(frame, session=session, seq=camera.seq, **times))
         camera.seq += 1
-    return late_s
 
 
 def main() -> None:
@@ -102,13 +98,13 @@ def main() -> None:
         Camera(Uplink(name, key, clock, given.port, "127.0.0.1"), frames[name], round(1e9 * loop_s))
         for name in given.cameras or frames
     ]
-    stop, late_s = threading.Event(), list[float]()
+    stop = threading.Event()
 
     def run() -> None:
         while not stop.is_set() and not all(one.uplink.started for one in cameras):
             time.sleep(0.05)
         print("sending", flush=True)
-        late_s.extend(send(cameras, clock, given.epoch_ns, stop))
+        send(cameras, clock, given.epoch_ns, stop)
 
     thread = threading.Thread(target=run)
     thread.start()
@@ -120,8 +116,6 @@ def main() -> None:
     thread.join()
     for one in cameras:
         one.uplink.close()
-    late_ms = 1e3 * np.percentile(late_s or [0.0], [50, 99])
-    print(json.dumps({"sent": len(late_s), "late_p50_ms": late_ms[0], "late_p99_ms": late_ms[1]}), flush=True)
 
 
 if __name__ == "__main__":

@@ -15,13 +15,11 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 
-from bench.report import COLOURS, figure, machine
-from bench.rigs import soak_verdict as verdict
+from bench.report import machine
 from bench.rigs.local import Rig, cpu_s, losses
 from bench.rigs.rooms import slower
-from bench.rigs.soak_verdict import Mapping, Minute, SoakHistory, grown, judge, mapped, warm_up_s
+from bench.rigs.soak_verdict import Finding, Mapping, Minute, SoakHistory, grown, judge, mapped
 from common.calibration.files import replacing
 from common.messages import HandPose, Health
 from common.messages.streams import MASTER
@@ -31,7 +29,7 @@ RIGS = ("desk", "wrist")
 DEVICES = {"left": "desk", "right": "desk", "wrist": "wrist", "imu": "wrist"}  # -> rig
 SCENE = "both-poses"  # closed: it can go on for ever; slow enough for three frames of a triple at a low rate
 DRIFT_PPM = {"left": 20.0, "right": -35.0, "wrist": 50.0, "imu": 8.0}
-_GREY, OUT = "#777777", Path("out/soak")
+OUT = Path("out/soak")
 
 
 class SoakRig(Rig):
@@ -113,82 +111,6 @@ class SoakRig(Rig):
         return {name: mapped(one.pid) for name, one in self.processes.items()}
 
 
-def draw(course: SoakHistory, title: str, file: Path) -> None:
-    """Draw memory, latency, poses and clocks over the minutes."""
-    made = figure(11.0, 5.8)
-    axes = made.subplots(2, 2, sharex=True)
-    for panel, at in zip((_growth, _latency, _poses, _clocks), axes.flat, strict=True):
-        panel(at, course)
-    warm = warm_up_s(course.times_s[-1]) / 60.0 if course.times_s else 0.0
-    for panel in axes.flat:
-        panel.axvspan(0.0, warm, color="#000000", alpha=0.05, linewidth=0)
-        panel.grid(alpha=0.25)
-        panel.margins(x=0.01)
-        if panel.get_legend_handles_labels()[0]:
-            panel.legend(fontsize=8, ncols=3)
-    for panel in axes[1]:
-        panel.set_xlabel("minutes (grey: warm-up, not judged)")
-    made.suptitle(title, fontsize=11)
-    made.savefig(file)
-
-
-def _growth(axes: Axes, course: SoakHistory) -> None:
-    times = np.array(course.times_s)
-    late = times >= (warm_up_s(times[-1]) if len(times) else 0.0)
-    for colour, name in zip(COLOURS, course.footprints, strict=False):
-        values = np.array(course.series(name, "rss_mb"))
-        if late.any():
-            label = f"{name} {verdict.memory_slope(course, name).per_h:+.2f} MB/h"
-            since = values - np.median(values[late][:12])
-            axes.plot(times / 60.0, since, color=colour, label=label, linewidth=1.2)
-        for step in verdict.steps_of(course.times_s, values) or []:
-            axes.axvline(step.minute, color=colour, linewidth=1.0, linestyle="--")
-            axes.text(step.minute, 2.6, f" +{step.mb:.0f} MB", color=colour, fontsize=8)
-    axes.axhline(1.0, color=_GREY, linewidth=0.8, linestyle=":")
-    axes.set_ylim(-3.0, 3.0)
-    axes.set_ylabel("resident memory since\nthe warm-up [MB]")
-
-
-def _latency(axes: Axes, course: SoakHistory) -> None:
-    minutes = [one.t_s / 60.0 for one in course.minutes]
-    for colour, name in zip(COLOURS, ("p50", "p99"), strict=False):
-        axes.plot(minutes, [getattr(one, f"{name}_ms") for one in course.minutes], color=colour, label=name)
-    axes.set_yscale("log")
-    axes.set_ylabel("latency of poses [ms]")
-    beside = axes.twinx()
-    beside.plot(minutes, [one.load for one in course.minutes], color=_GREY, linewidth=0.9, linestyle=":")
-    beside.set_ylim(bottom=0.0)
-    beside.set_ylabel("load of the machine (dotted)", color=_GREY, fontsize=8)
-
-
-def _poses(axes: Axes, course: SoakHistory) -> None:
-    minutes = [one.t_s / 60.0 for one in course.minutes]
-    axes.plot(minutes, [one.poses_hz for one in course.minutes], color=COLOURS[0], label="poses [1/s]")
-    axes.set_ylim(bottom=0.0)
-    axes.set_ylabel("poses a second")
-    beside = axes.twinx()
-    for colour, name in zip(COLOURS[1:], ("lost", "dropped", "skipped"), strict=False):
-        totals = [one.counts.get(name, 0) for one in course.minutes]
-        label = f"{name}: {totals[-1] if totals else 0}"
-        beside.plot(minutes, totals, color=colour, linewidth=1.2, label=label)
-    beside.set_ylabel("since the start", fontsize=8)
-    beside.legend(fontsize=8, loc="lower right")
-
-
-def _clocks(axes: Axes, course: SoakHistory) -> None:
-    """Draw what is left of each clock's offset after the straight line that its quartz is."""
-    late = [one for one in course.minutes if one.t_s > warm_up_s(course.minutes[-1].t_s)]
-    names = sorted({name for one in late for name in one.clock_offset_us})
-    for colour, name in zip(COLOURS, names, strict=False):
-        known = [(one.t_s, one.clock_offset_us[name]) for one in late if name in one.clock_offset_us]
-        if len(known) > 2:
-            times, offsets = np.array(known).T
-            ppm = verdict.slope(times, offsets).per_h / 3600.0
-            left = offsets - ppm * times
-            axes.plot(times / 60.0, left - np.median(left), color=colour, label=f"{name} {ppm:+.2f} ppm")
-    axes.set_ylabel("clock, without its\nstraight line [us]")
-
-
 def _run(options: argparse.Namespace, stop: threading.Event) -> tuple[SoakHistory, list[str]]:
     """Run for the time asked for, or until `stop`; return what was measured, and who ended by himself."""
     rig = SoakRig(OUT, options.marker_hz, options.wrist_hz)
@@ -224,7 +146,7 @@ def _show(minute: Minute, course: SoakHistory) -> None:
     )
 
 
-def _save(options: argparse.Namespace, course: SoakHistory, findings: Sequence[verdict.Finding] = ()) -> None:
+def _save(options: argparse.Namespace, course: SoakHistory, findings: Sequence[Finding] = ()) -> None:
     """Save all figures so far; whoever kills the soak still has them."""
     known = {
         **machine(),
@@ -252,10 +174,9 @@ def main(arguments: Sequence[str]) -> int:
     rates = f"marker cameras {options.marker_hz:g} Hz, wrist {options.wrist_hz:g} Hz"
     title = f"{length_min:.0f} minutes, {rates}"
     _save(options, course, findings)
-    draw(course, title, OUT / "soak.png")
     print(f"\n{title}")
     for one in findings:
         mark = {True: "ok", False: "NOT OK", None: "too short"}[one.ok]
         print(f"  {one.what:24s} {one.value:44s} {one.limit:16s} {mark}")
-    print(f"wrote {OUT / 'soak.png'} and {OUT / 'soak.json'}")
+    print(f"wrote {OUT / 'soak.json'}")
     return 1 if any(one.ok is False for one in findings) else 0

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.report import COLOURS, figure, rig_files
+from bench.report import rig_files
 from bench.study.trials import Task, Trial, performed, trials_of
 from common.arrays import Bool, Float, Int
 from common.hand.model import FINGERS
@@ -178,45 +178,12 @@ def lines_of(trials: Sequence[Trial], seed: int) -> Iterator[str]:
     yield f"ICC below {_ICC_GOAL}: {low}. Tracked, neither in sight: {sum(cell.blind for cell in cells)} trials."
 
 
-def draw(file: Path, trials: Sequence[Trial], seed: int) -> None:
-    """Draw errors by finger and pose, cells that are not reached, the paper's figures, and ICC."""
-    made = figure(14.0, 5.6)
-    axes, icc = made.subplots(1, 2, width_ratios=(3.2, 1.0))
-    cells, again, width = cells_of(trials), repeated(trials, seed), 0.13
-    poses = list(dict.fromkeys(cell.pose for cell in cells))
-    for k, pose in enumerate(poses):
-        own = [cell for cell in cells if cell.pose == pose]
-        x, colour = np.arange(5) + width * (k - 0.5 * (len(poses) - 1)), (*COLOURS, "#718096")[k % 6]
-        mean, sd = (np.nan_to_num([getattr(cell, name) for cell in own]) for name in ("mean_deg", "sd_deg"))
-        axes.bar(x, mean, 0.92 * width, yerr=sd, color=colour, label=pose.replace("_", " "), ecolor="#444444")
-        for at, cell in zip(x.tolist(), own, strict=True):
-            if not cell.is_reached:
-                text = f"not reached {cell.reached}/{cell.trials}"
-                axes.text(at, 0.3, text, rotation=90, ha="center", fontsize=7)
-    axes.axhline(_MEAN_LIMIT_DEG, color="#c53030", linestyle="--", label="paper: every mean below")
-    for finger, (low, high) in _MEAN_RANGE_DEG.items():
-        x = FINGERS.index(finger)
-        axes.fill_between([x - 0.47, x + 0.47], low, high, color="#c53030", alpha=0.15, linewidth=0.0)
-    axes.set_xticks(range(5), ["thumb (MCP)", *FINGERS[1:]])
-    axes.set_ylabel("absolute error of the PIP [°], mean ± sd")
-    axes.legend(fontsize=7.5, ncols=3, frameon=False)
-    icc.bar(np.arange(5) - 0.2, np.nan_to_num([one.icc for one in again]), 0.36, label="ours")
-    icc.bar(np.arange(5) + 0.2, list(_PAPER_ICC.values()), 0.36, color="#d9a5a5", label="paper")
-    icc.plot(np.arange(5) - 0.2, [one.truth_icc for one in again], "k_", markersize=12, label="true poses")
-    icc.axhline(_ICC_GOAL, color="#c53030", linestyle="--")
-    icc.set_xticks(range(5), FINGERS, rotation=30)
-    icc.set_title("ICC(1,1) between blocks")
-    icc.legend(fontsize=8, frameon=False)
-    made.savefig(file)
-
-
 def main(arguments: Sequence[str]) -> None:
     """Run the study; print its tables."""
     parser = argparse.ArgumentParser("python -m bench study", description=__doc__)
     parser.add_argument("--participants", type=int, default=12)
     parser.add_argument("--blocks", type=int, default=3, help="how often each makes the six poses")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every trial to FILE")
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw errors and repeatability")
     options = parser.parse_args(arguments)
     rig, cameras, hand = rig_files("wrist")
     task = Task(rig, cameras[rig.cameras[0]], hand, SEED, options.blocks)
@@ -225,5 +192,3 @@ def main(arguments: Sequence[str]) -> None:
     if options.json is not None:
         plain = [{name: np.asarray(getattr(one, name)).tolist() for name in one.__slots__} for one in trials]
         options.json.write_text(json.dumps(plain, indent=1))
-    if options.picture is not None:
-        draw(options.picture, trials, SEED)

@@ -18,7 +18,7 @@ def run(cameras: int, pose_ms: float = 6.0, message_ms: float = 0.2) -> ScaleRun
     cores = 90.0 * (pose_ms + cameras * message_ms) * 1e-3
     return ScaleRun(
         ROOM, cameras, 1, 90.0, 10.0, 900 * cameras, 900 * cameras, 0, 0, 0, 0, 0, 0, 90.0, 5.0, 9.0, cores,
-        {"ingest": 0.1}, 5000.0, 1.0, 2.0,
+        5000.0, 2.0,
     )  # fmt: skip
 
 
