@@ -28,10 +28,10 @@ from deploy.remote import DeployError, RigFile, read_rig
 SensorKind = Literal["camera", "imu", "tracker"]
 
 # seen by both kinds of rig alike
-TOGETHER = ("grasp", "both-poses", "both-curl", "both-travel", "both-moves", "gestures")
+TWO_RIG_SCENES = ("grasp", "both-poses", "both-curl", "both-travel", "both-moves", "gestures")
 # Scene -> its rigs, where it is no other than `desk`.
 _BEST = {
-    **dict.fromkeys(TOGETHER, ("desk-back3", "wrist-back3")),
+    **dict.fromkeys(TWO_RIG_SCENES, ("desk-back3", "wrist-back3")),
     "object": ("desk-wand",),
     "gestures": ("desk4",),  # fingers that bend towards one pair are seen by the other
 }
@@ -64,9 +64,9 @@ def sensors_of(calibration: Path, rigs: tuple[str, ...], scene: str) -> list[Sen
         raise DeployError(f"--rig {' --rig '.join(rigs)}: a rig stands twice")
     moves, _, light = scene.partition("@")
     hands = [rig.hand for rig in read.values()]
-    if len(set(hands)) < len(hands) and moves not in TOGETHER:
+    if len(set(hands)) < len(hands) and moves not in TWO_RIG_SCENES:
         raise DeployError(
-            f"--scene {scene}: rigs {', '.join(read)} see one hand together only in {', '.join(TOGETHER)}"
+            f"--scene {scene}: rigs {', '.join(read)} see one hand together only in {', '.join(TWO_RIG_SCENES)}"
         )
     if moves == "object" and not any(rig.objects for rig in read.values()):
         raise DeployError(

@@ -21,7 +21,7 @@ _PALM_JOINTS = np.setdiff1d(np.arange(26), CHAINS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sighted:
+class VisibleAt:
     """What is truly in sight at the moments of poses (N,)."""
 
     cameras: Int  # (N, M) marker cameras that have each marker in sight
@@ -34,11 +34,11 @@ class Sighted:
     @classmethod
     def of(cls, shown: Shown, solved: Solved) -> Self:
         """Of a pipeline's poses: what its own sensors have in sight."""
-        t_s, sight = solved.t_s, shown.line_of_sight
+        t_s, visibility = solved.t_s, shown.visibility
         about_s = 0.04  # a frame and a bit of every sensor: what was in sight then tells of a pose
-        seen = sight.cameras_of(t_s, about_s)
+        seen = visibility.cameras_of(t_s, about_s)
         cameras = seen if solved.markers else np.zeros_like(seen)
-        worn = sight.worn(t_s, about_s) & solved.wrist
+        worn = visibility.worn(t_s, about_s) & solved.wrist
         oriented = np.full(len(t_s), solved.wrist)
         by = np.concatenate([cameras[:, :_FINGERS] >= 2, worn], axis=1)
         changed = np.zeros(by.shape, np.int64)
@@ -87,16 +87,16 @@ class Figures:
     hz: float  # poses per second
 
     @classmethod
-    def of(cls, solved: Solved, sighted: Sighted) -> Self:
+    def of(cls, solved: Solved, visible_at: VisibleAt) -> Self:
         """Reckon them."""
         off, pip, joint_chi2, steps = solved.off_mm, solved.pip_deg, solved.joint_chi2, solved.steps_mm
         tracked = solved.poses.tracked
-        unseen = tracked & ~sighted.observed
+        unseen = tracked & ~visible_at.observed
         off_m = 0.020  # a joint that is tracked may not be farther off
         far = tracked & (np.linalg.norm(solved.poses.position_m - solved.truth_m, axis=2) > off_m)
         bits = max(int(tracked.sum()), 1)
         near = np.zeros(joint_chi2.shape, np.bool_)
-        near[:, CHAINS - 1] = sighted.hand_over[:, :, None]
+        near[:, CHAINS - 1] = visible_at.hand_over[:, :, None]
         span_s = float(solved.t_s[-1] - solved.t_s[0])
         worst = _most(steps)
         step_mm = 5.0
@@ -105,7 +105,7 @@ class Figures:
             fingers_mm=_mean(solved.fingers_mm),
             pip_deg=tuple(_mean(pip[:, f]) for f in range(_FINGERS)),
             four_deg=_mean(pip[:, 1:]),
-            hidden_deg=_mean(np.where(sighted.hidden, pip, np.nan)[:, 1:]),
+            hidden_deg=_mean(np.where(visible_at.hidden, pip, np.nan)[:, 1:]),
             valid=float(solved.poses.valid[:, 1:].mean()),
             tracked=float(tracked[:, 1:].mean()),
             inside=_inside(joint_chi2),
@@ -147,8 +147,8 @@ def ratios(fused: Solved, alone: Solved) -> Ratios:
     place = np.clip(np.searchsorted(fused.poses.t_ns, alone.poses.t_ns), 1, len(fused.t_s) - 1)
     before = fused.poses.t_ns[place] - alone.poses.t_ns > alone.poses.t_ns - fused.poses.t_ns[place - 1]
     place = place - before
-    together_ns = 17_000_000  # poses of two pipelines are compared that are no farther apart
-    near = np.abs(fused.poses.t_ns[place] - alone.poses.t_ns) <= together_ns
+    same_ns = 17_000_000  # poses of two pipelines are compared that are no farther apart
+    near = np.abs(fused.poses.t_ns[place] - alone.poses.t_ns) <= same_ns
 
     def ratio(ours: Float, theirs: Float) -> float:
         ours = np.where(near[:, None], ours[place], np.nan)
@@ -180,7 +180,7 @@ class Outcome:
         figures: dict[Kind, Figures] = {}
         for kind in KINDS:
             solved[kind] = Solved.of(both, solve(setups[kind], shown.messages), setups[kind])
-            figures[kind] = Figures.of(solved[kind], Sighted.of(shown, solved[kind]))
+            figures[kind] = Figures.of(solved[kind], VisibleAt.of(shown, solved[kind]))
         return cls(shown, solved, figures)
 
     @property

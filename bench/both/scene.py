@@ -80,7 +80,7 @@ class Both:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class Visibility:
     """What is truly in sight, frame by frame."""
 
     visible_t_s: Mapping[str, Float]  # camera -> (T,) scene times [s] of its frames
@@ -115,7 +115,7 @@ class Shown:
     both: Both  # the scene
     seconds: float  # how long it was watched
     messages: list[Observed]  # of all sensors, in the order of their stamps
-    line_of_sight: Sight
+    visibility: Visibility
 
 
 def in_order(messages: list[Observed]) -> list[Observed]:
@@ -170,7 +170,7 @@ def shown_of(both: Both, seconds: float, every: int = 1) -> Shown:
     frame_s = 1.0 / both.wrist.cameras[both.wrist.rig.cameras[0]].frame_rate_hz
     line_t = np.arange(1.0, seconds / frame_s - 1.0, 3.0) * frame_s
     cycles, line, tip = _cycles(both, line_t, frame_s)
-    return Shown(both, seconds, in_order(messages + cycles), Sight(times, paint, line_t, line, tip))
+    return Shown(both, seconds, in_order(messages + cycles), Visibility(times, paint, line_t, line, tip))
 
 
 def markers_shown(
@@ -293,7 +293,7 @@ def watched(both: Both, seconds: float) -> Shown:
         paint[camera] = np.array([_paint(view) for _, view, _ in found])
         messages += [message for message, _, _ in found]
     cycles, line_t, line, tip = cycles_of(both, seconds)
-    return Shown(both, seconds, in_order(messages + cycles), Sight(times, paint, line_t, line, tip))
+    return Shown(both, seconds, in_order(messages + cycles), Visibility(times, paint, line_t, line, tip))
 
 
 def cycles_of(both: Both, seconds: float) -> tuple[list[Observed], Float, Float, Bool]:

@@ -27,7 +27,7 @@ from common.hand.model import HandModel
 from common.messages import JOINT_COUNT, HandPose, Source
 from common.sim.motion import POSES, StudyPoses
 from common.sim.scene import Scene, view_centre
-from common.sim.together import FlexedWrist
+from common.sim.two_rigs import FlexedWrist
 from common.sim.wrist.scene import WristScene
 from master.gestures.features import FeatureExtractor
 from master.gestures.poses import PoseRecogniser

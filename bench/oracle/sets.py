@@ -355,6 +355,6 @@ def _thinned(messages: list[Observed]) -> list[Observed]:
 def _truth_of(shown: Shown) -> Truth:
     scene = shown.both.scene
     truth = truth_of(scene, shown.seconds)
-    cameras = shown.line_of_sight.cameras_of(1e-9 * (truth.t_ns - truth.t_ns[0]), 0.02)
+    cameras = shown.visibility.cameras_of(1e-9 * (truth.t_ns - truth.t_ns[0]), 0.02)
     markers = [scene.rig.markers.index(name) for name in FINGERS]
     return changed(truth, hidden=np.asarray(cameras[:, markers] < 2, np.bool_))

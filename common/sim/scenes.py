@@ -47,8 +47,8 @@ from common.sim.motion import (
 from common.sim.people import HandRoutine, load_leap
 from common.sim.render import Renderer
 from common.sim.scene import Card, Scene, view_centre
-from common.sim.together import TOGETHER, together_motion
 from common.sim.tracked import facing
+from common.sim.two_rigs import TWO_RIG_SCENES, two_rig_motion
 from common.sim.wrist.render import LIVE_STEP, LIVE_WRIST_RAD, WristRenderer
 from common.sim.wrist.scene import WRIST_NAMES, WristScene
 
@@ -153,7 +153,7 @@ class ObjectTravel(DriftingMotion):
         return rigid(rotation @ self._facing, place)
 
 
-NAMES = f"standard | lights | poses | hand-routine | object | leap:FILE.npz | {' | '.join(TOGETHER)}"
+NAMES = f"standard | lights | poses | hand-routine | object | leap:FILE.npz | {' | '.join(TWO_RIG_SCENES)}"
 VIEWS = f"{NAMES} | board | card"
 _LEAP = "leap:"
 _MOTIONS = {"poses": StudyPoses, "hand-routine": HandRoutine, "object": ObjectTravel}
@@ -171,7 +171,7 @@ def scene_by_name(
 
     `standard`, the same under light that changes (`lights`), the six poses of the Digits study (`poses`), a
     hand that follows the guided routine of `calibrate hand` (`hand-routine`), one beside a tracked object
-    that travels (`object`), one that moves as in front of a wrist device at the same time (`TOGETHER`), or
+    that travels (`object`), one that moves as in front of a wrist device at the same time (`TWO_RIG_SCENES`), or
     one that follows a recorded motion. `objects`: files of the objects that the rig names.
 
     Raises:
@@ -191,7 +191,7 @@ def scene_by_name(
     elif (make := _MOTIONS.get(name)) is not None:
         motion = make(model, centre_m, seed)
     else:
-        motion = together_motion(name, model, centre_m, seed)
+        motion = two_rig_motion(name, model, centre_m, seed)
     if motion is None:
         raise PhalanxError(f"scene {name!r}: there are {VIEWS} (board and card for cameras only)")
     cards = CARDS if name == "object" else ()

@@ -63,7 +63,7 @@ def lines(items: tuple[CheckItem, ...]) -> list[str]:
     return out
 
 
-TOGETHER = timedelta(minutes=1)  # one calibration writes several parts, one after the other
+SAME_RUN = timedelta(minutes=1)  # one calibration writes several parts, one after the other
 PartT = TypeVar("PartT", bound=Struct)
 
 
@@ -172,7 +172,7 @@ def _older(part: Provenance | None, base: Provenance | None) -> bool:
     """Whether `part` was measured before its `base`; undated: not known, False."""
     if part is None or base is None:
         return False
-    return datetime.fromisoformat(part.date) + TOGETHER < datetime.fromisoformat(base.date)
+    return datetime.fromisoformat(part.date) + SAME_RUN < datetime.fromisoformat(base.date)
 
 
 def _read(path: Path, kind: type[PartT]) -> PartT | str:

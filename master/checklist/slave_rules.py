@@ -336,10 +336,10 @@ class MovedRule:
         if len(cameras) == 2:
             share = outliers / max(poses * markers, 1)
             # share of the hand's markers whose rays miss each other, two cameras
-            apart, apart_well = 0.15, 0.05
+            begins_share, ends_share = 0.15, 0.05
             yield _verdict(
                 cameras,
-                beyond(share, apart, apart_well) if enough else None,
+                beyond(share, begins_share, ends_share) if enough else None,
                 f"What cameras {' and '.join(cameras)} see does not fit together: the rays of"
                 f" {100.0 * share:.0f} % of the markers miss each other.",
             )

@@ -254,7 +254,7 @@ def console_app(state: ConsoleState, host: str, port: int, login: LoginPage) -> 
     """Return the application behind its guards: own pages only, login or same user."""
     app = FastAPI(openapi_url=None)
     serve_sockets(app, state)
-    away_s = 30.0  # a page that sent nothing for so long, as on a busy machine, goes on where it was
+    silent_s = 30.0  # a page that sent nothing for so long, as on a busy machine, goes on where it was
     ui.run_with(
         app,
         title=TITLE,
@@ -262,7 +262,7 @@ def console_app(state: ConsoleState, host: str, port: int, login: LoginPage) -> 
         favicon="🖐",
         language="en-US",
         show_welcome_message=False,
-        reconnect_timeout=away_s,
+        reconnect_timeout=silent_s,
     )
     if login.password is not None:
         app.add_middleware(

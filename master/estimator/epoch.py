@@ -208,7 +208,7 @@ class EpochSteps:
         self.now, self.at = fields(self.state), fields(space)
         self._state, self._space, self._work = boxed(self.state), boxed(space), boxed(record(Scratch))
         self._ground = self._space["ground"]
-        self._lines_of_sight = self._space["epoch_prior"]["lines_of_sight"]
+        self._cycle_rows = self._space["epoch_prior"]["cycle_rows"]
         hand, device = boxed(HandTables.of(model, parameters)), boxed(device)
         self._model = Model(hand, boxed(settings.record()), mounts, self._cameras, device)
         self.at.scratch.search.wrist_share[0] = settings.wrist_share
@@ -222,7 +222,7 @@ class EpochSteps:
         self._rays = bound(observe_rays, nothing, nothing[..., 0].copy(), own, self.on_hand, observed)
         self._points = bound(observe_points, scratch[2], own[self.on_hand], 0.0, observed)
         self._count = bound(count_rows, mounts, observed, self._ground)
-        self._cycle = bound(observe_wrist, device, rows, 0.0, self._lines_of_sight)
+        self._cycle = bound(observe_wrist, device, rows, 0.0, self._cycle_rows)
         self._pose = bound(pose, hand, mounts, _AT_ORIGIN, np.zeros(20), self._work, *scratch)
         rig, state, space = self._model, self._state, self._space
         self._prepare = bound(prepare_epoch, rig, state, space)
@@ -240,15 +240,15 @@ class EpochSteps:
 
     def observe(self, at: Epoch, *, continuous: bool) -> None:
         """Write the rows of an epoch, and count them."""
-        task, lines_of_sight = self.at.task, self.at.epoch_prior.lines_of_sight
+        task, cycle_rows = self.at.task, self.at.epoch_prior.cycle_rows
         task.t_ns[0], task.second_order[0], task.continuous[0] = at.t_ns, at.second_order, continuous
         task.process_noise_rad2[0] = 0.0 if at.orientation is None else at.orientation.process_noise_rad2
         if at.wrist is None:
-            lines_of_sight.rows[0] = 0.0
-            lines_of_sight.lit[:] = lines_of_sight.shown[:] = 0.0
+            cycle_rows.rows[0] = 0.0
+            cycle_rows.lit[:] = cycle_rows.shown[:] = 0.0
         else:
             self.at.prior.law[:] = at.wrist.law
-            self._cycle(self._model.device, at.wrist, self._settings.light_rad, self._lines_of_sight)
+            self._cycle(self._model.device, at.wrist, self._settings.light_rad, self._cycle_rows)
         bones_m2 = self._settings.bones_m**2
         if at.cov_m2 is not None:
             points, cov = at.points_m[self.on_hand], at.cov_m2[self.on_hand]

@@ -25,7 +25,7 @@ from master.estimator.finger_surface import NO_MOVES, OWN_MOVES, Surface, first_
 from master.estimator.kinematics import twist_hand
 from master.estimator.parameters import HandTables
 from master.estimator.problem import Rig
-from master.estimator.sensors import LinesOfSight
+from master.estimator.sensors import CycleRows
 from master.estimator.settings import Settings
 from master.fabrik.linear_algebra import cholesky, substitute
 
@@ -116,7 +116,7 @@ def _dip_sigma(settings: Settings, f: int, pip: float) -> float:
 
 
 @inner
-def _rows(rig: Rig, lines: LinesOfSight, prior: Prior, f: int, scan: Scan) -> float:
+def _rows(rig: Rig, lines: CycleRows, prior: Prior, f: int, scan: Scan) -> float:
     """Write residuals (8,), derivatives (8, 4) by `look`; return half chi square."""
     seen, G, r, J, a = scan.surface.seen, scan.surface.J, scan.r, scan.J, scan.angles
     for i in range(ROWS):
@@ -192,7 +192,7 @@ def _look(rig: Rig, prior: Prior, f: int, moves: int, scan: Scan) -> None:
 
 
 @inner
-def scan_finger(rig: Rig, lines: LinesOfSight, prior: Prior, f: int, scan: Scan) -> None:
+def scan_finger(rig: Rig, lines: CycleRows, prior: Prior, f: int, scan: Scan) -> None:
     """Write the minimum of finger f along its PIPs, from `Scan.x` to `chi2`."""
     low, high = rig.hand.limits[f, 2, 0], rig.hand.limits[f, 2, 1]
     scan.chi2[f] = inf
@@ -218,7 +218,7 @@ def scan_finger(rig: Rig, lines: LinesOfSight, prior: Prior, f: int, scan: Scan)
 
 
 @inner
-def _start(rig: Rig, lines: LinesOfSight, prior: Prior, f: int, node: int, scan: Scan) -> int:
+def _start(rig: Rig, lines: CycleRows, prior: Prior, f: int, node: int, scan: Scan) -> int:
     """Set the pose from which a node is searched; return in how many steps.
 
     From the pose of the PIP before; at the first node, and every few others, rather from one that is tried.
@@ -247,9 +247,7 @@ def _start(rig: Rig, lines: LinesOfSight, prior: Prior, f: int, node: int, scan:
 
 
 @inner
-def _descend(
-    rig: Rig, lines: LinesOfSight, prior: Prior, f: int, steps: int, scan: Scan
-) -> tuple[float, float]:
+def _descend(rig: Rig, lines: CycleRows, prior: Prior, f: int, steps: int, scan: Scan) -> tuple[float, float]:
     """Search the minimum at one PIP; return half chi square and line length [px]."""
     a, surface, step, length, cost = scan.angles, scan.surface, scan.S[0], 0.0, 0.0
     for k in range(steps + 1):
@@ -275,7 +273,7 @@ def _descend(
 
 
 @inner
-def _keep(rig: Rig, lines: LinesOfSight, prior: Prior, f: int, node: int, length: float, scan: Scan) -> None:
+def _keep(rig: Rig, lines: CycleRows, prior: Prior, f: int, node: int, length: float, scan: Scan) -> None:
     """Write where the search at a node has ended."""
     for k in range(4):
         scan.x[f, node, k] = scan.angles[4 * f + k]
@@ -368,7 +366,7 @@ def _densities(rig: Rig, prior: Prior, f: int, unseen: bool, scan: Scan) -> None
 
 
 @inner
-def weigh_hands(rig: Rig, lines: LinesOfSight, prior: Prior, scan: Scan) -> None:
+def weigh_hands(rig: Rig, lines: CycleRows, prior: Prior, scan: Scan) -> None:
     """Write each hand's evidence by fingers whose tips are seen, and probabilities."""
     others, share, natural = 0, scan.share, rig.settings.natural_finger_weight
     for f in range(1, 5):
@@ -413,7 +411,7 @@ def _at(scan: Scan, f: int, place: float, out: Float) -> None:
 
 
 @inner
-def choose(rig: Rig, lines: LinesOfSight, prior: Prior, f: int, scan: Scan) -> None:
+def choose(rig: Rig, lines: CycleRows, prior: Prior, f: int, scan: Scan) -> None:
     """Write the estimate of finger f from the densities that `weigh_hands` left.
 
     It is the median of the part that weighs most, its likeliest pose, and the spread. Where frames follow

@@ -165,7 +165,7 @@ def _terms(S: Float, k: int, r1: float, r2: float, ox: float, oy: float, oz: flo
 
 
 @inlined
-def _away(S: Float, k: int) -> float:
+def _least_distance(S: Float, k: int) -> float:
     """How far the way from sphere k to k + 1 is from the camera at least [m]."""
     ax, ay, az = S[k + 1, 0] - S[k, 0], S[k + 1, 1] - S[k, 1], S[k + 1, 2] - S[k, 2]
     foot = -(S[k, 0] * ax + S[k, 1] * ay + S[k, 2] * az) / (ax * ax + ay * ay + az * az)
@@ -211,7 +211,7 @@ def laser_centroid(device: Any, f: int, work: Surface) -> float:
     for k in range(7):
         _terms(S, k, radius[k], radius[k + 1], 0.0, 0.0, 0.0, work.camera[k])
         rounded_m = 1e-9
-        work.begins[k] = _away(S, k) - max(radius[k], radius[k + 1]) - rounded_m
+        work.begins[k] = _least_distance(S, k) - max(radius[k], radius[k + 1]) - rounded_m
         if work.reached[k] > 0.0:
             _terms(S, k, radius[k], radius[k + 1], laser[0], laser[1], laser[2], work.laser[k])
     step, first = (high - low) / (RAYS - 1), _ROOT - 1 if f == 0 else 0

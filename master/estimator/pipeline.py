@@ -72,7 +72,7 @@ class Between:
     """Orientation of an IMU at a time."""
 
     q_wxyz: Wxyz
-    away_s: float  # how far from samples that is [s]
+    gap_s: float  # how far from samples that is [s]
     drift_rad: float  # how far its heading has drifted since the first sample, standard deviation [rad]
 
 
@@ -195,7 +195,7 @@ class OrientationTrack:
         rotation = self._rig_world @ matrix_of(found.q_wxyz) @ self._palm_imu.T
         if heading_rad is None and near is not None:
             rotation = _twist_about(self._up, near.T_rig_palm[:3, :3] @ rotation.T) @ rotation
-        tilt_2 = self._imu.orientation_sigma_rad**2 + (DEFAULT.palm_process_noise_rad_s * found.away_s) ** 2
+        tilt_2 = self._imu.orientation_sigma_rad**2 + (DEFAULT.palm_process_noise_rad_s * found.gap_s) ** 2
         free_rad = 10.0  # constrains nothing beside any marker
         about_2 = max((free_rad if heading_rad is None else heading_rad) ** 2, tilt_2)
         along = np.outer(self._up, self._up)

@@ -39,8 +39,8 @@ from master.estimator.sensors import (
     TILT,
     WRIST_ANGLES,
     CameraArrays,
+    CycleRows,
     Device,
-    LinesOfSight,
     flexed_palm,
     project,
 )
@@ -82,7 +82,7 @@ class EpochPrior:
     axes: Float = array(3, 3)  # rows, rig axes, about which tilt and heading turn a forearm
     place: Float = array(3)  # [m] where the palm is
     place_w2: Float = array(1)  # how firmly; 0: not known
-    lines_of_sight: LinesOfSight = part(LinesOfSight)
+    cycle_rows: CycleRows = part(CycleRows)
 
 
 class Iterate:
@@ -393,7 +393,7 @@ def rotate_by_vector(rotation: Float, R: Float, out: Float) -> None:
 @inner
 def finger_rows(rig: Rig, epoch_prior: EpochPrior, f: int, at: Iterate, search: Search) -> float:
     """Add the rows of finger f at `search.rows.angles`; return their cost."""
-    hand, lines_of_sight, work, surface = rig.hand, epoch_prior.lines_of_sight, search.rows, search.surface
+    hand, cycle_rows, work, surface = rig.hand, epoch_prior.cycle_rows, search.rows, search.surface
     start = hand.first[f]
     count, base = hand.first[f + 1] - start, 6 + at.x.shape[0]
     J, r, w, column = search.local_J, search.local_r, search.local_w, search.column
@@ -402,24 +402,24 @@ def finger_rows(rig: Rig, epoch_prior: EpochPrior, f: int, at: Iterate, search: 
     column[count], column[count + 1] = base + f, base + WRIST_ANGLES
     column[count + 2], column[count + 3] = base + WRIST_ANGLES + 1, base + LED_SCALE
     size, cost = count + 4, 0.0
-    if lines_of_sight.lit[f] == 0.0 and lines_of_sight.shown[f] == 0.0:
+    if cycle_rows.lit[f] == 0.0 and cycle_rows.shown[f] == 0.0:
         return 0.0
     look(hand, rig.device, search.palm_camera, search.wrist_axes, work.angles, f, MOVES, surface)
     for what in range(2):
-        if (what == 0 and lines_of_sight.lit[f] == 0.0) or (what == 1 and lines_of_sight.shown[f] == 0.0):
+        if (what == 0 and cycle_rows.lit[f] == 0.0) or (what == 1 and cycle_rows.shown[f] == 0.0):
             continue
         rows, first = 2, 0
         if what == 0:
-            W = lines_of_sight.laser_W[f]
-            r[0] = surface.seen[0] + lines_of_sight.lack[f, 0] - lines_of_sight.laser[f, 0]
-            r[1] = surface.seen[1] + lines_of_sight.lack[f, 1] - lines_of_sight.laser[f, 1]
+            W = cycle_rows.laser_W[f]
+            r[0] = surface.seen[0] + cycle_rows.lack[f, 0] - cycle_rows.laser[f, 0]
+            r[1] = surface.seen[1] + cycle_rows.lack[f, 1] - cycle_rows.laser[f, 1]
         else:
-            W, first = lines_of_sight.tip_W[f], 2
-            r[0] = surface.seen[2] - lines_of_sight.tip[f, 0]
-            r[1] = surface.seen[3] - lines_of_sight.tip[f, 1]
-            if lines_of_sight.depth_w2[f] > 0.0:
+            W, first = cycle_rows.tip_W[f], 2
+            r[0] = surface.seen[2] - cycle_rows.tip[f, 0]
+            r[1] = surface.seen[3] - cycle_rows.tip[f, 1]
+            if cycle_rows.depth_w2[f] > 0.0:
                 rows = 3
-                r[2] = surface.seen[4] + at.z[LED_SCALE] - lines_of_sight.depth[f]
+                r[2] = surface.seen[4] + at.z[LED_SCALE] - cycle_rows.depth[f]
         for i in range(rows):
             for c in range(count):
                 J[i, c] = 0.0
@@ -427,11 +427,11 @@ def finger_rows(rig: Rig, epoch_prior: EpochPrior, f: int, at: Iterate, search: 
                     J[i, c] += surface.J[first + i, k] * work.by[4 * f + k, c]
             for c in range(3):
                 J[i, count + c] = surface.J[first + i, 4 + c]
-            J[i, count] *= lines_of_sight.teaches[f]
+            J[i, count] *= cycle_rows.teaches[f]
             J[i, count + 3] = 1.0 if i == 2 else 0.0
         for i in range(rows):
             if i == 2:
-                w[2] = lines_of_sight.depth_w2[f] * r[2]
+                w[2] = cycle_rows.depth_w2[f] * r[2]
             else:
                 w[i] = W[i, 0] * r[0] + W[i, 1] * r[1]
             cost += 0.5 * w[i] * r[i]
@@ -443,7 +443,7 @@ def finger_rows(rig: Rig, epoch_prior: EpochPrior, f: int, at: Iterate, search: 
                 at.gradient[column[a]] += share * J[i, a] * w[i]
             p0 = W[0, 0] * J[0, a] + W[0, 1] * J[1, a]
             p1 = W[1, 0] * J[0, a] + W[1, 1] * J[1, a]
-            p2 = lines_of_sight.depth_w2[f] * J[2, a] if rows == 3 else 0.0
+            p2 = cycle_rows.depth_w2[f] * J[2, a] if rows == 3 else 0.0
             for b in range(size):
                 total = p0 * J[0, b] + p1 * J[1, b]
                 if rows == 3:

@@ -240,7 +240,7 @@ class Device:
         )
 
 
-class LinesOfSight:
+class CycleRows:
     """What one strobe cycle shows of five fingers, as rows; rays are (x, y, 1)."""
 
     lit: Float = array(5)  # 1 where a laser point is a row, and `shown` where a fingertip is
@@ -291,18 +291,18 @@ def loosen(W: Float, J: Float, row: int, cov: Float) -> None:
 
 @inner
 def loosen_short(
-    device: Any, lines_of_sight: LinesOfSight, f: int, length_px: float, point: Float, A: Float
+    device: Any, cycle_rows: CycleRows, f: int, length_px: float, point: Float, A: Float
 ) -> bool:
     """Take from a laser point's information what a partly hidden line leaves open.
 
     Changes `laser_W`; `length_px` is the line's, were all of it seen. Returns whether the line is that short.
     """
-    seen_px = lines_of_sight.laser_px[f]
-    x, y = lines_of_sight.laser[f, 0], lines_of_sight.laser[f, 1]
+    seen_px = cycle_rows.laser_px[f]
+    x, y = cycle_rows.laser[f, 0], cycle_rows.laser[f, 1]
     whole = 0.85  # of the line that is expected: a shorter one is hidden in part
     if seen_px == 0.0 or seen_px > whole * length_px or not on_plane(device, x, y, point, A):
         return False
-    W = lines_of_sight.laser_W[f]
+    W = cycle_rows.laser_W[f]
     a, b, c = _covariance(W)
     off = 0.5 * (length_px - seen_px) / device.focal[0]
     for axis in range(2):
@@ -345,7 +345,7 @@ class WristRows(NamedTuple):
 
 @kernel
 def observe_wrist(boxed_device: Any, seen: WristRows, depth_sigma: float, boxed_out: Any) -> None:
-    """Write the rows of a strobe cycle into `boxed_out`, (1,) `LinesOfSight`.
+    """Write the rows of a strobe cycle into `boxed_out`, (1,) `CycleRows`.
 
     `depth_sigma`: standard deviation of the logarithms of `tip_depth`; 0: they are not used.
     """
@@ -373,8 +373,8 @@ def observe_wrist(boxed_device: Any, seen: WristRows, depth_sigma: float, boxed_
             out.laser_px[f] = seen.laser_px[f] if seen.laser_px[f] > 0.0 else 0.0
         x, y = tip[f, 0], tip[f, 1]
         if np.isfinite(x + y + tip_sigma_px[f]):
-            away_m = 0.1  # a fingertip of which no laser point measures the distance
-            near = point[2] if out.lit[f] > 0.0 else away_m
+            assumed_m = 0.1  # a fingertip of which no laser point measures the distance
+            near = point[2] if out.lit[f] > 0.0 else assumed_m
             variance = (tip_sigma_px[f] / device.focal[0]) ** 2 + device.tip2[f] / near**2
             inverse_2(variance, 0.0, variance, out.tip_W[f])
             out.tip[f, 0], out.tip[f, 1], out.shown[f], out.rows[0] = x, y, 1.0, 1.0

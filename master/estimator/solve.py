@@ -187,7 +187,7 @@ def linearise(problem: Problem, h: int, at: Iterate, search: Search) -> float:
         for f in range(5):
             search.twist[f] = z[f]
         twist_hand(hand, search.twist)
-        if epoch_prior.lines_of_sight.rows[0] > 0.0:
+        if epoch_prior.cycle_rows.rows[0] > 0.0:
             flexion, deviation = z[WRIST_ANGLES], z[WRIST_ANGLES + 1]
             flexed_palm(rig.device.palm, flexion, deviation, search.palm_camera, search.wrist_axes)
             for f in range(5):

@@ -115,7 +115,7 @@ def _depth_noise(
 
     Perspective constrains it to centimetres only, and the fit is as sure of it as of the last epoch's.
     """
-    triangulated, seen, sight = ground.most[0] > 1, ground.seen[0] > 0, epoch_prior.line_of_sight
+    triangulated, seen, line_of_sight = ground.most[0] > 1, ground.seen[0] > 0, epoch_prior.line_of_sight
     if triangulated or state.triangulated_ns[0] == NEVER_NS:
         state.triangulated_ns[0] = t_ns
     if triangulated or not seen:
@@ -125,7 +125,7 @@ def _depth_noise(
     for joint in range(26):
         for i in range(3):
             for j in range(3):
-                out.cov[joint, i, j] += sigma_m * sigma_m * sight[i] * sight[j]
+                out.cov[joint, i, j] += sigma_m * sigma_m * line_of_sight[i] * line_of_sight[j]
 
 
 @kernel
@@ -198,7 +198,7 @@ def fit_epoch(
     posterior(problem, task, space.ground.numbers[0], blank, scratch, found)
     if found.z.shape[0] == EXTRAS:
         extras_only(epoch_prior, found, search)
-    if epoch_prior.lines_of_sight.rows[0] > 0.0:
+    if epoch_prior.cycle_rows.rows[0] > 0.0:
         take_scanned(rig, space.ground, space.scan, found, search.rows)
     oriented = epoch_prior.oriented[0] > 0.0
     found.contrary[0] = contrary(epoch_prior, found.palm, found.z, search) if oriented else 0.0
@@ -212,9 +212,9 @@ def _take_rates(settings: Settings, state: HandState, t_ns: int, shown: Bool, an
         f, before_ns, rate, before = a // 4, state.t_ns[0], state.rates[a], state.angles[a]
         if shown[f] and state.hidden_ns[f] != NEVER_NS:
             before_ns, rate, before = state.hidden_ns[f], state.then_rates[f, a], state.then[f, a]
-        away_s = (t_ns - before_ns) * 1e-9
-        share = 1.0 - exp(-away_s / settings.rate_memory_s)
-        state.rates[a] = rate + share * ((angles[a] - before) / away_s - rate)
+        since_s = (t_ns - before_ns) * 1e-9
+        share = 1.0 - exp(-since_s / settings.rate_memory_s)
+        state.rates[a] = rate + share * ((angles[a] - before) / since_s - rate)
 
 
 @kernel

@@ -119,7 +119,7 @@ class Forearm:
         tilted, half_heading = self._tilted(self._rig_world, z), 0.5 * float(z[HEADING])
         heading = cos(half_heading), 0.0, 0.0, sin(half_heading)
         rotation = matrix_of(quaternion_product(quaternion_product(tilted, heading), self._forearm(found)))
-        sigma = hypot(DEFAULT.strap_rad, DEFAULT.palm_process_noise_rad_s * found.away_s)
+        sigma = hypot(DEFAULT.strap_rad, DEFAULT.palm_process_noise_rad_s * found.gap_s)
         axes = matrix_of(self._rig_world).T.copy()  # about x and y of the world the forearm tilts,
         axes[2] = matrix_of(tilted)[:, 2]  # about the estimated vertical it turns
         wide = z_cov[HEADING, HEADING] + process_noise + np.trace(z_cov[_WRIST, _WRIST])
@@ -157,7 +157,7 @@ class Forearm:
         found = self._between(t_ns)
         if found is None:
             return NO_WORLD
-        half_heading = DEFAULT.palm_process_noise_rad_s * found.away_s
+        half_heading = DEFAULT.palm_process_noise_rad_s * found.gap_s
         forearm, (flexion, deviation) = self._forearm(found), wrist_angles_rad.tolist()
         (ff, fd), (_, dd) = wrist_cov.tolist()
         c, s = cos(deviation), sin(deviation)

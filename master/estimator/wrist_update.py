@@ -25,7 +25,7 @@ from master.estimator.sensors import (
     EXTRAS,
     LED_SCALE,
     WRIST_ANGLES,
-    LinesOfSight,
+    CycleRows,
     flexed_palm,
     loosen,
     loosen_short,
@@ -65,7 +65,7 @@ _FK, _IK = int(SolverMode.FK), int(SolverMode.IK)
 
 
 @inner
-def _expected(rig: Rig, state: HandState, task: Task, lines: LinesOfSight, scan: Scan, prior: Prior) -> None:
+def _expected(rig: Rig, state: HandState, task: Task, lines: CycleRows, scan: Scan, prior: Prior) -> None:
     """Write the fingers' prior before a strobe cycle; bring its rows to the epoch."""
     settings = rig.settings
     dt_s = (task.t_ns[0] - state.t_ns[0]) * 1e-9
@@ -113,7 +113,7 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
     rig = Rig(model.hand[0], model.settings[0], model.mounts, model.cameras, model.device[0])
     state, space, settings = boxed_state[0], boxed_space[0], rig.settings
     task, epoch_prior, scan, prior = space.task, space.epoch_prior, space.scan, space.prior
-    lines, z = epoch_prior.lines_of_sight, state.z
+    lines, z = epoch_prior.cycle_rows, state.z
     dt_s = 0.0 if state.z_ns[0] == NEVER_NS else (task.t_ns[0] - state.z_ns[0]) * 1e-9
     predict_extras(settings, state, dt_s, task.process_noise_rad2[0], epoch_prior, space.extras)
     state.z_ns[0] = task.t_ns[0]
@@ -142,7 +142,7 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
 
 
 @inner
-def _scan(rig: Rig, lines: LinesOfSight, prior: Prior, f: int, scan: Scan, task: Task) -> None:
+def _scan(rig: Rig, lines: CycleRows, prior: Prior, f: int, scan: Scan, task: Task) -> None:
     """Search the minima of a lit finger; drop rows that no pose explains."""
     settings = rig.settings
     scan_finger(rig, lines, prior, f, scan)
@@ -165,7 +165,7 @@ def _scan(rig: Rig, lines: LinesOfSight, prior: Prior, f: int, scan: Scan, task:
 
 @inner
 def _choose(
-    rig: Rig, lines: LinesOfSight, prior: Prior, f: int, scan: Scan, task: Task, state: HandState
+    rig: Rig, lines: CycleRows, prior: Prior, f: int, scan: Scan, task: Task, state: HandState
 ) -> None:
     """Choose a pose of a scanned finger; note what it teaches."""
     settings, shown = rig.settings, lines.shown[f] > 0.0
@@ -197,7 +197,7 @@ def _length_px(scan: Scan, f: int) -> float:
 
 
 @inner
-def _count(lines: LinesOfSight, ground: Ground) -> None:
+def _count(lines: CycleRows, ground: Ground) -> None:
     """Count the rows of a wrist device; tips without laser points count for nothing."""
     lit, shown = 0, 0
     for f in range(5):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from common.sim.two_rigs import TWO_RIG_SCENES
 
 from common.arrays import Float, Image, Int
 from common.errors import PhalanxError
@@ -19,7 +20,6 @@ from common.recording.frame_recording import Illumination
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from common.sim.scenes import scene_by_name
-from common.sim.together import TOGETHER
 from common.sim.wrist.motion import OnForearm
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
@@ -118,7 +118,7 @@ class Played:
 
     shown: Scene | None = None  # what cameras of markers saw, or None
     wrist_scene: WristScene | None = None  # what a wrist device saw, or None
-    together: bool = False  # the scene is one for both kinds of rig, whether or not there are both
+    two_rigs: bool = False  # the scene is one for both kinds of rig, whether or not there are both
 
     @classmethod
     def of(cls, setup: RigSetup, name: str, seed: int) -> "Played":
@@ -129,17 +129,17 @@ class Played:
         """
         moves, hand = name.partition("@")[0], setup.hand.profile
         watched = {one.name: one for one in setup.objects}
-        together = moves in TOGETHER
+        two_rigs = moves in TWO_RIG_SCENES
         if setup.wrist_rig is None:
-            return cls(scene_by_name(name, setup.rig, setup.cameras, hand, seed, watched), None, together)
+            return cls(scene_by_name(name, setup.rig, setup.cameras, hand, seed, watched), None, two_rigs)
         wrist_scene = WristScene.by_name(name, setup.wrist_rig, setup.cameras, hand, seed)
         if not setup.has_markers:
-            return cls(None, wrist_scene, together)
-        if not together:
+            return cls(None, wrist_scene, two_rigs)
+        if not two_rigs:
             raise PhalanxError(
-                f"scene {name!r}: cameras and wrist device see one hand only in {', '.join(TOGETHER)}"
+                f"scene {name!r}: cameras and wrist device see one hand only in {', '.join(TWO_RIG_SCENES)}"
             )
-        return cls(scene_by_name(moves, setup.rig, setup.cameras, hand, seed, watched), wrist_scene, together)
+        return cls(scene_by_name(moves, setup.rig, setup.cameras, hand, seed, watched), wrist_scene, two_rigs)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,7 +205,7 @@ def _judge(
     if played.shown is None:
         assert played.wrist_scene is not None, "one of the two there is"
         return _of_wrist(poses, row, setup, played.wrist_scene, epoch_ns, progress)
-    judged = _of_markers(poses, setup, played.shown, epoch_ns, progress, hidden=played.together)
+    judged = _of_markers(poses, setup, played.shown, epoch_ns, progress, hidden=played.two_rigs)
     if played.wrist_scene is None:
         return judged
     wrist_scene = laser_scores(poses, played.wrist_scene, epoch_ns, progress)

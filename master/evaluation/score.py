@@ -290,9 +290,9 @@ def tracked_share(poses: ObjectPoses, truth: ObjectTruth) -> float:
     """Share of true epochs whose nearest pose, not farther than usual, is tracked."""
     if len(truth.t_ns) == 0 or len(poses) == 0:
         return 0.0
-    apart = [np.median(np.diff(t_ns)) for t_ns in (truth.t_ns, poses.t_ns) if len(t_ns) > 1]
+    periods_ns = [np.median(np.diff(t_ns)) for t_ns in (truth.t_ns, poses.t_ns) if len(t_ns) > 1]
     nearest = nearest_rows(poses.t_ns, truth.t_ns)
-    near = np.abs(poses.t_ns[nearest] - truth.t_ns) < max(apart, default=_NEAR_NS)
+    near = np.abs(poses.t_ns[nearest] - truth.t_ns) < max(periods_ns, default=_NEAR_NS)
     return float((near & poses.tracked[nearest]).mean())
 
 

@@ -263,7 +263,9 @@ Stage = Callable[[str], AbstractContextManager[None]]
 FORGET_S = 0.5  # after this long without markers nothing is known of the hand any more
 _FIT_M2 = (3e-3) ** 2  # of a finger's marker as the palm's fit has it
 _PALM_JOINTS = np.array([PALM, WRIST, *METACARPALS])
-_AWAY = rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))  # a hand before a camera at the origin
+_IN_VIEW = rigid(
+    np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6])
+)  # a hand before a camera at the origin
 
 
 class FabrikSolver:
@@ -363,14 +365,14 @@ class FabrikSolver:
     def rehearse(self) -> None:
         """Call every kernel once, so that none is compiled while a hand is tracked."""
         self.sync.at(0)
-        _, places = self._palm.pose(_AWAY, np.full((5, 4), 0.2))
+        _, places = self._palm.pose(_IN_VIEW, np.full((5, 4), 0.2))
         points, cov = np.full((self._count, 3), np.nan), np.full((self._count, 3, 3), np.nan)
         points[self.on_hand], cov[self.on_hand] = places, 1e-6 * np.eye(3)
         seen = np.ones((len(self._centres), self._count))
         first = self.solve_once(points, cov, seen)
         self.triangulate(100.0 * np.stack([seen, seen], axis=-1), seen, seen, first, 0.0)
         targets = np.empty_like(places)
-        targets_of(places, cov[self.on_hand], _AWAY, places, _FIT_M2, targets)
+        targets_of(places, cov[self.on_hand], _IN_VIEW, places, _FIT_M2, targets)
 
     def _recent(self, t_ns: int) -> tuple[SolvedHand | None, float]:
         """Return the last hand, if it is still informative, and its age [s]."""

@@ -207,14 +207,14 @@ def _distance(track: Float, k: int, i: int, which: int, leap_px_s: float) -> flo
 
     Infinite: that is a leap; NaN: there are no two places.
     """
-    nearest, away_s = -1, inf
+    nearest, gap_s = -1, inf
     for j in range(k):
-        if isfinite(track[j, i, 0]) and abs(track[j, i, 2] - track[k, which, 2]) < away_s:
-            nearest, away_s = j, abs(track[j, i, 2] - track[k, which, 2])
+        if isfinite(track[j, i, 0]) and abs(track[j, i, 2] - track[k, which, 2]) < gap_s:
+            nearest, gap_s = j, abs(track[j, i, 2] - track[k, which, 2])
     if nearest < 0:  # also where the place itself is NaN
         return nan
     distance = hypot(track[nearest, i, 0] - track[k, which, 0], track[nearest, i, 1] - track[k, which, 1])
-    return distance if distance <= SETTINGS.leap_px + leap_px_s * away_s else inf
+    return distance if distance <= SETTINGS.leap_px + leap_px_s * gap_s else inf
 
 
 @inner

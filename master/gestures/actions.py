@@ -126,7 +126,7 @@ class PinchMonitor(ActionMonitor):
         clear_m = min(gaps[k] for k in others) - gap
         if clear_m >= own.away_m:
             return finger
-        opening_rad = float(touch.apart_rad[finger] + touch.apart_sigma_rad[finger])
+        opening_rad = float(touch.opening_rad[finger] + touch.opening_sigma_rad[finger])
         if clear_m < own.clear_m or opening_rad > own.apart_rad:
             return None
         return finger if min(float(seen.curl[1 + k]) for k in others) < own.fist_curl else None
@@ -301,10 +301,10 @@ class ThumbTapMonitor:
             self._clear_ns, self._clear_rad = seen.t_ns, _bend_rad(seen)
         # cosine: a thumb that lies on the back of a segment touches no key
         palmar = bool(touch.key_palmar[finger, segment] > (-0.3))
-        apart = (seen.t_ns - self._tapped_ns) * 1e-9 >= own.apart_s
+        separate = (seen.t_ns - self._tapped_ns) * 1e-9 >= own.apart_s
         approached = (seen.t_ns - self._clear_ns) * 1e-9 <= own.approach_s
         near = gap <= own.touch_gap_m and may_begin and palmar
-        if near and apart and approached and is_pad(seen, own):
+        if near and separate and approached and is_pad(seen, own):
             self._touch = _Touch(seen.t_ns, self._clear_rad, gap, [now])
         return []
 

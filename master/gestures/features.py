@@ -304,9 +304,11 @@ def _take_seen(markers: Float, caps: Float) -> None:
     for f in range(5):
         own[f], least = -1, inf
         for m in range(markers.shape[0]):
-            apart = length(minus(point_at(markers, m), point_at(caps, f)))  # NaN where the marker is not seen
-            if apart < least:
-                own[f], least = m, apart
+            distance = length(
+                minus(point_at(markers, m), point_at(caps, f))
+            )  # NaN where the marker is not seen
+            if distance < least:
+                own[f], least = m, distance
         for g in range(5):
             own_m = 0.012  # a marker farther from where the hand has the cap is not this finger's
             if least > own_m or length(minus(point_at(markers, own[f]), point_at(caps, g))) < least:
@@ -330,8 +332,8 @@ class ThumbTouch(NamedTuple):
     Attributes:
         gap_m: (4,) to the last segment of each finger, skin to skin [m], negative: pressed.
         middle_m: (4, 3) half way between them [m], rig frame.
-        apart_rad: (4,) by how much the pads of both are turned from facing each other, the worse of the two.
-        apart_sigma_rad: (4,) how sure that is.
+        opening_rad: (4,) by how much the pads of both are turned from facing each other, the worse of the two.
+        opening_sigma_rad: (4,) how sure that is.
         key_gap_m: (4, 3) from the thumb's last segment to each segment of each finger, from the knuckle on [m].
         key_palmar: (4, 3) cosine between the way to the thumb there and the palmar side of the segment.
         key_sigma_m: (4, 3) standard deviation [m] of those gaps: of both places along the way between them.
@@ -339,8 +341,8 @@ class ThumbTouch(NamedTuple):
 
     gap_m: Float
     middle_m: Float
-    apart_rad: Float
-    apart_sigma_rad: Float
+    opening_rad: Float
+    opening_sigma_rad: Float
     key_gap_m: Float
     key_palmar: Float
     key_sigma_m: Float
@@ -356,8 +358,8 @@ def thumb_touch(features: HandFeatures, radius_m: Float) -> ThumbTouch:
     out = ThumbTouch(
         gap_m=np.empty(4),
         middle_m=np.empty((4, 3)),
-        apart_rad=np.empty(4),
-        apart_sigma_rad=np.empty(4),
+        opening_rad=np.empty(4),
+        opening_sigma_rad=np.empty(4),
         key_gap_m=np.empty((4, 3)),
         key_palmar=np.empty((4, 3)),
         key_sigma_m=np.empty((4, 3)),
@@ -378,11 +380,11 @@ def _write(joints: Float, cov: Float, pads: Float, radius: Float, out: ThumbTouc
             on_a, on_b = _shares(joints, radius, thumb, tip, a, b)
             start, end = _on(joints, thumb, tip, on_a), _on(joints, a, b, on_b)
             off = minus(end, start)
-            apart_m = length(off)
-            over = max(apart_m, 1e-9)
+            distance_m = length(off)
+            over = max(distance_m, 1e-9)
             way = off[0] / over, off[1] / over, off[2] / over
             radius_a = radius[thumb] + on_a * (radius[tip] - radius[thumb])
-            out.key_gap_m[k, s] = apart_m - radius_a - (radius[a] + on_b * (radius[b] - radius[a]))
+            out.key_gap_m[k, s] = distance_m - radius_a - (radius[a] + on_b * (radius[b] - radius[a]))
             side = _palmar(k + 1, s, joints, pads)
             out.key_palmar[k, s] = -dot(way, side)
             out.key_sigma_m[k, s] = _sigma_m(cov, thumb, tip, on_a, a, b, on_b, way)
@@ -391,8 +393,8 @@ def _write(joints: Float, cov: Float, pads: Float, radius: Float, out: ThumbTouc
                 for i in range(3):
                     out.middle_m[k, i] = start[i] + (radius_a + 0.5 * out.gap_m[k]) * way[i]
                 face = min(dot(way, thumb_side), -dot(way, side))
-                out.apart_rad[k] = acos(min(max(face, -1.0), 1.0))
-        out.apart_sigma_rad[k] = hypot(thumb_sigma_rad, _direction_sigma_rad(k + 1, joints, cov))
+                out.opening_rad[k] = acos(min(max(face, -1.0), 1.0))
+        out.opening_sigma_rad[k] = hypot(thumb_sigma_rad, _direction_sigma_rad(k + 1, joints, cov))
 
 
 @inner
@@ -415,14 +417,14 @@ def _shares(joints: Float, radius: Float, a: int, a_end: int, b: int, b_end: int
         minus(point_at(joints, a_end), point_at(joints, a)),
         minus(point_at(joints, b_end), point_at(joints, b)),
     )
-    apart = minus(point_at(joints, b), point_at(joints, a))
+    offset = minus(point_at(joints, b), point_at(joints, a))
     uu, vv, uv, au, bv, square = (
         dot(u, u),
         dot(v, v),
         dot(u, v),
-        dot(apart, u),
-        dot(apart, v),
-        dot(apart, apart),
+        dot(offset, u),
+        dot(offset, v),
+        dot(offset, offset),
     )
     on_a = _foot_of(au / uu, uv / uu, square / uu, 2.0 * bv / uu, vv / uu, radius[a_end] - radius[a], uu)
     on_b = _foot_of(-bv / vv, uv / vv, square / vv, -2.0 * au / vv, uu / vv, radius[b_end] - radius[b], vv)

@@ -104,20 +104,20 @@ def _about(
         off = place[f, 0] - centre[0], place[f, 1] - centre[1], place[f, 2] - centre[2]
         along = dot(off, a)
         flat = off[0] - along * a[0], off[1] - along * a[1], off[2] - along * a[2]
-        away = sqrt(dot(flat, flat))
-        over = max(away, 1e-6)
+        distance = sqrt(dot(flat, flat))
+        over = max(distance, 1e-6)
         out = flat[0] / over, flat[1] / over, flat[2] / over
-        fits = hypot(away - radius, along) <= round_m
+        fits = hypot(distance - radius, along) <= round_m
         if f == 0:
             if not fits:
                 return False
             thumb = out
             continue
         pad = pads[f, 0], pads[f, 1], pads[f, 2]
-        apart = acos(min(max(dot(out, thumb), -1.0), 1.0))
+        angle_rad = acos(min(max(dot(out, thumb), -1.0), 1.0))
         # cosine between the pad's side and the way to the middle, at least
         inwards = -dot(out, pad) / sqrt(dot(pad, pad)) >= (-0.3)
-        good += 1 if fits and inwards and apart >= opposed else 0
+        good += 1 if fits and inwards and angle_rad >= opposed else 0
     return good >= least
 
 
@@ -280,11 +280,11 @@ def spread_m(tips: Tips, then: Tips) -> float:
     most = 0.0
     for f in range(5):
         if tips.known[f] and then.known[f]:
-            away, away_before = 0.0, 0.0
+            distance, distance_before = 0.0, 0.0
             for i in range(3):
-                away += (tips.place_m[f, i] - middle[i] / count) ** 2
-                away_before += (then.place_m[f, i] - before[i] / count) ** 2
-            most = max(most, abs(sqrt(away) - sqrt(away_before)))
+                distance += (tips.place_m[f, i] - middle[i] / count) ** 2
+                distance_before += (then.place_m[f, i] - before[i] / count) ** 2
+            most = max(most, abs(sqrt(distance) - sqrt(distance_before)))
     return most
 
 

@@ -198,8 +198,8 @@ def _difference(other: str, shape: PoseShape, examples: Sequence[Example]) -> st
     residuals = np.median([_residuals(shape, example) for example in examples], axis=0)
     value = np.median([example.quantities.value for example in examples], axis=0)
     parts: list[str] = []
-    apart = 3  # quantities that are named where two poses differ
-    columns: list[int] = np.argsort(-residuals)[:apart].tolist()
+    most = 3  # quantities that are named where two poses differ
+    columns: list[int] = np.argsort(-residuals)[:most].tolist()
     for column in columns:
         if residuals[column] < 0.5:
             break

@@ -38,14 +38,14 @@ def clock_offset(ours: Track, theirs: Track) -> tuple[int, float, float]:
     b, first_b = _speeds(theirs)
     half = 0.5 * min(np.isfinite(a).sum(), np.isfinite(b).sum())
     least_s = 2.0  # that both must show together
-    together = min(len(a), len(b), max(least_s * 1e9 / _STEP_NS, half))
-    score = _masked_correlation(a, b, together)
+    overlap = min(len(a), len(b), max(least_s * 1e9 / _STEP_NS, half))
+    score = _masked_correlation(a, b, overlap)
     best = int(np.argmax(score))
     correlated = 0.5
     if not score[best] > correlated:
         raise FitError(
             f"the speeds of poses and motion capture agree nowhere (correlation {max(score[best], 0.0):.2f} at best, of"
-            f" {together * _STEP_NS * 1e-9:.1f} s or more together): the same hand at the same time? Where both have"
+            f" {overlap * _STEP_NS * 1e-9:.1f} s or more together): the same hand at the same time? Where both have"
             " one clock and one frame, give --aligned"
         )
     inner = score[best - 1 : best + 2]
@@ -54,8 +54,8 @@ def clock_offset(ours: Track, theirs: Track) -> tuple[int, float, float]:
         curvature = inner[0] - 2.0 * inner[1] + inner[2]
         shift = 0.5 * (inner[0] - inner[2]) / curvature if curvature < 0.0 else 0.0
     lags = np.arange(len(score)) - best
-    alternative, apart_ns = 0.9, 500_000_000  # a second peak that counts
-    far = np.where(np.abs(lags) * _STEP_NS > apart_ns, score, -1.0)
+    alternative, separation_ns = 0.9, 500_000_000  # a second peak that counts
+    far = np.where(np.abs(lags) * _STEP_NS > separation_ns, score, -1.0)
     second = int(np.argmax(far))
     alternative_s = (
         (second - best) * _STEP_NS * 1e-9 if far[second] > alternative * score[best] else float("nan")
@@ -82,7 +82,7 @@ def _speeds(track: Track) -> tuple[Float, int]:
     return np.where(some, total / np.maximum(known.sum(axis=1), 1), np.nan), int(t_ns[0])
 
 
-def _masked_correlation(a: Float, b: Float, together: float) -> Float:
+def _masked_correlation(a: Float, b: Float, overlap: float) -> Float:
     """Correlation of `a` and shifted `b`, lags of `signal.correlate`; -1: too few."""
     known_a, known_b = np.isfinite(a).astype(np.float64), np.isfinite(b).astype(np.float64)
     a = np.where(known_a > 0.0, a - np.nanmean(a), 0.0)
@@ -96,7 +96,7 @@ def _masked_correlation(a: Float, b: Float, together: float) -> Float:
     variance_a = of(a * a, known_b) - sum_a**2 / count
     variance_b = of(known_a, b * b) - sum_b**2 / count
     least = 1e-9 * max(float((a * a).sum()), float((b * b).sum()), 1e-12)
-    good = (count > together - 0.5) & (variance_a > least) & (variance_b > least)
+    good = (count > overlap - 0.5) & (variance_a > least) & (variance_b > least)
     spread = np.sqrt(np.where(good, variance_a * variance_b, 1.0))
     return np.where(good, (of(a, b) - sum_a * sum_b / count) / spread, -1.0)
 

@@ -150,7 +150,7 @@ class ContactMonitor:
         self._touching[name] = touching
         last = 3 * np.arange(5) + 2
         centre = np.where(pose.valid[_PALM], pose.position_m[_PALM], np.nan)
-        free = _away(distance[bones[:5]], sigma[bones[:5]])
+        free = _is_far(distance[bones[:5]], sigma[bones[:5]])
         carried = self._carried[name].push(pose.t_ns, T, centre, float(distance[palm]), free)
         return Contact(
             hand=pose.hand,
@@ -165,7 +165,7 @@ class ContactMonitor:
         )
 
 
-def _away(distance: Float, sigma: Float) -> bool:
+def _is_far(distance: Float, sigma: Float) -> bool:
     """Whether fingers (5,) surely hold nothing (a thumb alone does not); NaN: open."""
     free = 2.5  # standard deviations of a distance beyond which a finger surely does not touch
     return bool((np.nan_to_num(distance - free * sigma, nan=-np.inf)[1:] > FAR_M).all())

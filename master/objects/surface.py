@@ -385,8 +385,8 @@ class Features:
             return np.zeros(0, np.bool_)
         points, radius = self.points[: self.beads], self.radius_m[: self.beads]
         line_of_sight = eye - points
-        away = np.linalg.norm(line_of_sight, axis=1)
-        ahead = line_of_sight / away[:, None]
+        distance = np.linalg.norm(line_of_sight, axis=1)
+        ahead = line_of_sight / distance[:, None]
         across = cross(ahead, np.eye(3)[np.argmin(np.abs(ahead), axis=1)])
         across /= np.linalg.norm(across, axis=1, keepdims=True)
         # The near half of the ball, so that the rod that it is on is not before it.
@@ -395,4 +395,4 @@ class Features:
         hidden = self.surface.hides(eye, points[:, None] + radius[:, None, None] * off)
         bead_px = 2.5  # radius of a bead that is found nearly always
         bead_seen = 0.75  # share of a bead that must not be behind the object
-        return (radius * focal_px >= ease * bead_px * away) & ((~hidden).mean(axis=1) >= ease * bead_seen)
+        return (radius * focal_px >= ease * bead_px * distance) & ((~hidden).mean(axis=1) >= ease * bead_seen)

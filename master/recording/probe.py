@@ -100,8 +100,8 @@ class Probe:
 
     def _work(self) -> None:
         while self._worker.wait():
-            together_s = 0.2  # to wake a thread and a link for each message would cost several times as much
-            self._at_once.wait(together_s)
+            batch_s = 0.2  # to wake a thread and a link for each message would cost several times as much
+            self._at_once.wait(batch_s)
             while (message := self._worker.take(0.0)) is not None:
                 try:
                     self._bus.publish("taken", sender_of(message), message)

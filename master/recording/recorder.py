@@ -257,7 +257,7 @@ class RawAsker:
 
     def _refused(self, camera: _Camera, bus: Bus, error: BusError) -> None:
         """Restart where the camera was away and has ended; else the refusal is final."""
-        if camera.begun and self._was_away(camera, bus):
+        if camera.begun and self._was_absent(camera, bus):
             camera.begun, camera.number = False, camera.number + 1
             self._ask(camera, bus)
             return
@@ -265,7 +265,7 @@ class RawAsker:
         verb = "ended" if camera.begun else "not recorded"
         self._notify(f"camera {camera.name}: raw frames {verb}: {error}")
 
-    def _was_away(self, camera: _Camera, bus: Bus) -> bool:
+    def _was_absent(self, camera: _Camera, bus: Bus) -> bool:
         """Whether it ended its recording for want of us, not for a fault of its own."""
         try:
             answer = bus.ask(Command(camera.name, "report"), _ASK_S)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from bench.both.fusion import Figures, Sighted, ratios
-from bench.both.scene import Both, Shown, Sight, Solved
+from bench.both.fusion import Figures, VisibleAt, ratios
+from bench.both.scene import Both, Shown, Solved, Visibility
 from bench.played import START_NS
 from common.arrays import Float
 from common.geometry.transforms import matrix_to_quaternion
@@ -56,18 +56,18 @@ def shown(visible_area: float = 100.0, line: float = 0.02) -> Shown:
     """So much paint of every marker in both cameras, and so much line on every finger, at all times."""
     times = np.arange(0.0, 6.0, 1.0 / HZ)
     cameras = BOTH.markers.rig.cameras
-    line_of_sight = Sight(
+    visibility = Visibility(
         dict.fromkeys(cameras, times),
         {name: np.full((len(times), 6), visible_area) for name in cameras},
         times,
         np.full((len(times), 5), line),
         np.zeros((len(times), 5), np.bool_),
     )
-    return Shown(BOTH, 6.0, [], line_of_sight)
+    return Shown(BOTH, 6.0, [], visibility)
 
 
 def figures(one: Solved, of: Shown) -> Figures:
-    return Figures.of(one, Sighted.of(of, one))
+    return Figures.of(one, VisibleAt.of(of, one))
 
 
 def test_a_hand_without_error_has_none_and_every_bit_is_true() -> None:
@@ -157,20 +157,20 @@ def _moved(pose: HandPose, R_extra: Float, shift: Float) -> HandPose:
 def test_a_finger_is_in_sight_around_the_frame_that_shows_it() -> None:
     both = shown(visible_area=0.0, line=0.0)
     name = BOTH.markers.rig.cameras[0]
-    both.line_of_sight.visible_px2[name][120, INDEX] = 50.0  # at 2 s
-    seen = both.line_of_sight.cameras_of(np.array([1.94, 1.97, 2.0, 2.03, 2.06]), 0.04)[:, INDEX]
+    both.visibility.visible_px2[name][120, INDEX] = 50.0  # at 2 s
+    seen = both.visibility.cameras_of(np.array([1.94, 1.97, 2.0, 2.03, 2.06]), 0.04)[:, INDEX]
     assert seen.tolist() == [0, 1, 1, 1, 0]
 
 
 def test_hand_overs_are_where_sight_changes() -> None:
     both = shown()
     for name in BOTH.markers.rig.cameras:
-        both.line_of_sight.visible_px2[name][180:, INDEX] = 0.0  # from 3 s on
-    sighted = Sighted.of(both, solved())
-    near = sighted.hand_over[:, INDEX]
+        both.visibility.visible_px2[name][180:, INDEX] = 0.0  # from 3 s on
+    visible_at = VisibleAt.of(both, solved())
+    near = visible_at.hand_over[:, INDEX]
     assert near[np.abs(T_S - 3.04) < 0.45].all()
     assert not near[np.abs(T_S - 3.04) > 0.55].any()
-    assert not sighted.hand_over[:, 2].any()
+    assert not visible_at.hand_over[:, 2].any()
 
 
 def test_ratios_compare_what_both_call_valid() -> None:

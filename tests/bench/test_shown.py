@@ -39,11 +39,9 @@ def test_markers_are_reported_near_the_truth_and_only_where_paint_is_in_sight(ma
         seen = np.isfinite(message.uv[:, 0])
         off += np.linalg.norm(message.uv - uv, axis=1)[seen].tolist()
         k = int(
-            np.argmin(
-                np.abs(made.line_of_sight.visible_t_s[message.camera] - 1e-9 * (message.t_ns - START_NS))
-            )
+            np.argmin(np.abs(made.visibility.visible_t_s[message.camera] - 1e-9 * (message.t_ns - START_NS)))
         )
-        assert (made.line_of_sight.visible_px2[message.camera][k][seen] > 0.0).all()
+        assert (made.visibility.visible_px2[message.camera][k][seen] > 0.0).all()
     assert len(off) > 100
     assert np.median(off) < 5.0  # what is seen of a cap is not its middle
     assert max(off) < 12.0
@@ -54,5 +52,5 @@ def test_lines_and_tips_are_reported_only_where_they_are_in_sight(made: Shown) -
     line = np.array([np.isfinite(message.laser_uv[:, 0]) for message in cycles])
     tip = np.array([np.isfinite(message.tip_uv[:, 0]) for message in cycles])
     assert line.any()
-    assert not (line & (made.line_of_sight.line_m < 2e-3)).any()
-    assert not (tip & ~made.line_of_sight.tip).any()
+    assert not (line & (made.visibility.line_m < 2e-3)).any()
+    assert not (tip & ~made.visibility.tip).any()

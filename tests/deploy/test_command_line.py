@@ -8,7 +8,7 @@ import pytest
 from common.calibration import RigCalibration
 from common.sim.scene import APART_PPM, LATE_NS
 from common.sim.scenes import NAMES
-from common.sim.together import TOGETHER
+from common.sim.two_rigs import TWO_RIG_SCENES
 from common.sim.wrist.scene import AMBIENTS, MOTIONS
 from deploy import commands, demo
 from deploy.remote import DeployError
@@ -337,6 +337,6 @@ def test_a_scene_of_both_kinds_is_played_before_both(
 
 def test_the_demo_runs_its_cameras_as_the_standard_scene_says() -> None:
     # The launcher imports nothing of what it starts, so these stand twice.
-    assert demo.TOGETHER == TOGETHER
+    assert demo.TWO_RIG_SCENES == TWO_RIG_SCENES
     assert demo._LATE_MS * 1e6 == LATE_NS
     assert demo._APART_PPM == APART_PPM

@@ -22,7 +22,7 @@ from common.hand.model import WRIST, HandJoints, HandModel
 from common.hand.wrist import STRAIGHT, forearm_palm
 from common.sim.motion import HandMotion, HandState
 from common.sim.scene import STANDARD_SEED, CameraTiming, optics_of
-from common.sim.together import TOGETHER, together_motion
+from common.sim.two_rigs import TWO_RIG_SCENES, two_rig_motion
 from common.sim.wrist.capsules import GROUPS, THING_GROUP, HandCapsules, bodies_of
 from common.sim.wrist.motion import MOTIONS, wrist_motion
 
@@ -215,7 +215,7 @@ class LineTruth(NamedTuple):
 
 Ambient = Literal["dark", "indoor", "bright", "sun"]
 AMBIENTS: tuple[Ambient, ...] = get_args(Ambient)
-WRIST_NAMES = f"{' | '.join((*MOTIONS, *TOGETHER))}, each with @{' | @'.join(AMBIENTS)}"
+WRIST_NAMES = f"{' | '.join((*MOTIONS, *TWO_RIG_SCENES))}, each with @{' | @'.join(AMBIENTS)}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -312,14 +312,14 @@ class WristScene:
     ) -> "WristScene":
         """Create the scene called MOTION or MOTION@AMBIENT.
 
-        A motion of `TOGETHER` is also that of a marker rig.
+        A motion of `TWO_RIG_SCENES` is also that of a marker rig.
 
         Raises:
             PhalanxError: No such motion or light; a rig, camera or hand that does not fit.
         """
         moves, _, ambient = name.partition("@")
         model = HandModel.of(hand)
-        motion = wrist_motion(moves, model, seed) or together_motion(moves, model, np.zeros(3), seed)
+        motion = wrist_motion(moves, model, seed) or two_rig_motion(moves, model, np.zeros(3), seed)
         if motion is None or (ambient or "indoor") not in AMBIENTS:
             raise PhalanxError(f"scene {name!r}: for a wrist rig there are {WRIST_NAMES}")
         return cls(rig, cameras, model, motion, cast(Ambient, ambient or "indoor"), seed)

@@ -256,8 +256,8 @@ class Commands:
             device = f":{camera.device}" if camera.device else ""
             return [*line, "--camera", f"v4l2{device}", *shlex.split(camera.options)]
         index = [one.name for one in self.plan.cameras].index(camera.name)
-        apart_ms = 5.0  # cameras that nobody synchronises are taken one after the other
-        late_ms = (time.monotonic_ns() - epoch_ns) * 1e-6 + apart_ms * index
+        offset_ms = 5.0  # cameras that nobody synchronises are taken one after the other
+        late_ms = (time.monotonic_ns() - epoch_ns) * 1e-6 + offset_ms * index
         world = ["--truth", str(Path(self.plan.truth).resolve()), "--truth-rig", self.plan.world]
         scene = ["--scene", "standard" if view == "still" else view, "--scene-epoch-ns", str(epoch_ns)]
         return [*line, "--camera", "synthetic", *world, *scene, "--start-offset-ms", f"{late_ms:.3f}"]

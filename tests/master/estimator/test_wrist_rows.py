@@ -42,25 +42,25 @@ def spd(rng: np.random.Generator, n: int) -> Float:
 
 
 def laser(whole: Whole, seen: Seen, off: float) -> None:
-    lines_of_sight = whole.epoch_prior.lines_of_sight
-    lines_of_sight.rows[0], lines_of_sight.lit[:], lines_of_sight.teaches[:] = 1.0, 1.0, 1.0
-    lines_of_sight.lack[:] = whole.rng.normal(0.0, 0.02, (5, 2))
-    lines_of_sight.laser[:] = seen.predicted_laser + lines_of_sight.lack + off * whole.rng.normal(size=(5, 2))
-    lines_of_sight.laser_W[:] = [spd(whole.rng, 2) for _ in range(5)]
+    cycle_rows = whole.epoch_prior.cycle_rows
+    cycle_rows.rows[0], cycle_rows.lit[:], cycle_rows.teaches[:] = 1.0, 1.0, 1.0
+    cycle_rows.lack[:] = whole.rng.normal(0.0, 0.02, (5, 2))
+    cycle_rows.laser[:] = seen.predicted_laser + cycle_rows.lack + off * whole.rng.normal(size=(5, 2))
+    cycle_rows.laser_W[:] = [spd(whole.rng, 2) for _ in range(5)]
 
 
 def tip(whole: Whole, seen: Seen, off: float) -> None:
-    lines_of_sight = whole.epoch_prior.lines_of_sight
-    lines_of_sight.rows[0], lines_of_sight.shown[:], lines_of_sight.teaches[:] = 1.0, 1.0, 1.0
-    lines_of_sight.tip[:] = seen.tip + off * whole.rng.normal(size=(5, 2))
-    lines_of_sight.tip_W[:] = [spd(whole.rng, 2) for _ in range(5)]
+    cycle_rows = whole.epoch_prior.cycle_rows
+    cycle_rows.rows[0], cycle_rows.shown[:], cycle_rows.teaches[:] = 1.0, 1.0, 1.0
+    cycle_rows.tip[:] = seen.tip + off * whole.rng.normal(size=(5, 2))
+    cycle_rows.tip_W[:] = [spd(whole.rng, 2) for _ in range(5)]
 
 
 def tip_depth(whole: Whole, seen: Seen, off: float) -> None:
     tip(whole, seen, off)
-    lines_of_sight = whole.epoch_prior.lines_of_sight
-    lines_of_sight.depth[:] = np.log(seen.depth_m) + whole.z[LED_SCALE] + off * whole.rng.normal(size=5)
-    lines_of_sight.depth_w2[:] = whole.rng.uniform(1.0, 9.0, 5)
+    cycle_rows = whole.epoch_prior.cycle_rows
+    cycle_rows.depth[:] = np.log(seen.depth_m) + whole.z[LED_SCALE] + off * whole.rng.normal(size=5)
+    cycle_rows.depth_w2[:] = whole.rng.uniform(1.0, 9.0, 5)
 
 
 def orientation(whole: Whole, seen: Seen, off: float) -> None:
@@ -107,18 +107,18 @@ def test_the_laser_row_is_that_of_closed_form_and_lack(wrist_case: WristCase) ->
     for seed in range(4):
         whole, seen = hand(wrist_case, seed)
         laser(whole, seen, 0.3)
-        lines_of_sight, n = whole.epoch_prior.lines_of_sight, whole.n
+        cycle_rows, n = whole.epoch_prior.cycle_rows, whole.n
         by_free = whole.parameters.by_parameters(whole.parameters.complete[:, None].copy(), whole.x).reshape(
             5, 4, n
         )
         expected, cost = np.zeros(6 + n + len(whole.z)), 0.0
         for f in range(5):
-            r = seen.predicted_laser[f] + lines_of_sight.lack[f] - lines_of_sight.laser[f]
-            pull = seen.by[f, :2].T @ lines_of_sight.laser_W[f] @ r
+            r = seen.predicted_laser[f] + cycle_rows.lack[f] - cycle_rows.laser[f]
+            pull = seen.by[f, :2].T @ cycle_rows.laser_W[f] @ r
             expected[6 : 6 + n] += by_free[f].T @ pull[:4]
             expected[6 + n + f] += pull[4]
             expected[6 + n + WRIST_ANGLES : 6 + n + WRIST_ANGLES + 2] += pull[5:]
-            cost += 0.5 * r @ lines_of_sight.laser_W[f] @ r
+            cost += 0.5 * r @ cycle_rows.laser_W[f] @ r
         found, gradient, _ = whole.cost()
         assert found == pytest.approx(cost, rel=1e-9)
         np.testing.assert_allclose(gradient, expected, atol=1e-9)
@@ -142,7 +142,7 @@ def test_rows_that_are_not_seen_say_nothing(wrist_case: WristCase) -> None:
     whole, seen = hand(wrist_case, 1)
     tip_depth(whole, seen, 0.3)
     laser(whole, seen, 0.3)
-    whole.epoch_prior.lines_of_sight.lit[:] = whole.epoch_prior.lines_of_sight.shown[:] = 0.0
+    whole.epoch_prior.cycle_rows.lit[:] = whole.epoch_prior.cycle_rows.shown[:] = 0.0
     cost, gradient, normal = whole.cost()
     assert cost == 0.0
     assert not gradient.any()
@@ -157,9 +157,9 @@ def test_a_finger_constrains_its_own_angles_and_twist_and_the_wrist_angles(
     whole, seen = hand(wrist_case, 2)
     tip_depth(whole, seen, 0.3)
     laser(whole, seen, 0.3)
-    lines_of_sight = whole.epoch_prior.lines_of_sight
-    lines_of_sight.lit[:] = lines_of_sight.shown[:] = np.arange(5) == 2
-    lines_of_sight.teaches[:] = teaches
+    cycle_rows = whole.epoch_prior.cycle_rows
+    cycle_rows.lit[:] = cycle_rows.shown[:] = np.arange(5) == 2
+    cycle_rows.teaches[:] = teaches
     _, gradient, _ = whole.cost()
     own, extras = np.flatnonzero(whole.parameters.free // 4 == 2), 6 + whole.n
     moved = set(np.flatnonzero(gradient).tolist())

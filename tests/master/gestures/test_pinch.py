@@ -30,8 +30,8 @@ def changed(
 ) -> ThumbTouch:
     return touch._replace(
         gap_m=1e-3 * np.array(gap_mm),
-        apart_rad=np.full(4, np.radians(apart_deg)),
-        apart_sigma_rad=np.full(4, np.radians(sigma_deg)),
+        opening_rad=np.full(4, np.radians(apart_deg)),
+        opening_sigma_rad=np.full(4, np.radians(sigma_deg)),
         key_sigma_m=np.full((4, 3), 1e-3 * sigma_mm),
     )
 

@@ -40,4 +40,4 @@ def test_the_sigma_of_how_pads_face_is_that_of_the_ends_over_the_length() -> Non
     assert seen is not None
     length = np.linalg.norm(np.diff(seen.joints_m[CHAINS[:2, 2:]], axis=1)[:, 0], axis=1)
     want = np.hypot(np.sqrt(2e-6) / length[0], np.sqrt(8e-6) / length[1])
-    np.testing.assert_allclose(found.apart_sigma_rad[0], want, rtol=1e-9)
+    np.testing.assert_allclose(found.opening_sigma_rad[0], want, rtol=1e-9)

@@ -16,7 +16,7 @@ from common.recording.frame_recording import Illumination
 from common.sim.motion import Cylinder, HandMotion, HandState
 from common.sim.scenes import scene_by_name
 from common.sim.sensors import SimulatedImu
-from common.sim.together import TOGETHER
+from common.sim.two_rigs import TWO_RIG_SCENES
 from common.sim.wrist.capsules import THING_GROUP, bodies_of
 from common.sim.wrist.render import SURFACE_AT_M, WristRenderer, led_levels
 from common.sim.wrist.scene import WristScene
@@ -196,7 +196,7 @@ def test_an_imu_next_to_the_camera_feels_the_forearm_and_not_the_palm() -> None:
     np.testing.assert_allclose(rotated, expected, atol=0.02)  # its scale is off by 1 %
 
 
-@pytest.mark.parametrize("name", TOGETHER)
+@pytest.mark.parametrize("name", TWO_RIG_SCENES)
 def test_what_marker_rigs_see_at_the_same_time_is_found_by_name(name: str) -> None:
     shown = WristScene.by_name(f"{name}@dark", RIG, CAMERAS, HAND, 7)
     seen = scene_by_name(name, DESK, DESK_CAMERAS, HAND, 7)

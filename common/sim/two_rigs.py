@@ -143,11 +143,11 @@ _MOTIONS: Mapping[str, Callable[[HandModel, Float, int], HandMotion]] = {
     "both-moves": Moves,
     "gestures": Gestures,
 }
-TOGETHER = tuple(_MOTIONS)
+TWO_RIG_SCENES = tuple(_MOTIONS)
 
 
-def together_motion(name: str, model: HandModel, centre_m: Float, seed: int) -> HandMotion | None:
-    """Motion of a name of `TOGETHER` about (3,) [m], rig frame; None: no such.
+def two_rig_motion(name: str, model: HandModel, centre_m: Float, seed: int) -> HandMotion | None:
+    """Motion of a name of `TWO_RIG_SCENES` about (3,) [m], rig frame; None: no such.
 
     The place alone differs between rigs: with the same hand and seed the fingers, the turns of the palm, the
     bend of the wrist and the shifts are the same.

@@ -14,7 +14,7 @@ from common.sim.motion import HandMotion, HandState
 from common.sim.scene import view_centre
 from common.sim.scenes import scene_by_name
 from common.sim.sensors import SimulatedImu
-from common.sim.together import TOGETHER, together_motion
+from common.sim.two_rigs import TWO_RIG_SCENES, two_rig_motion
 from common.sim.wrist.scene import WristScene
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -32,7 +32,7 @@ RATE_HZ = 100
 
 
 def motion_of(name: str, seed: int = 7) -> HandMotion:
-    motion = together_motion(name, MODEL, CENTRE, seed)
+    motion = two_rig_motion(name, MODEL, CENTRE, seed)
     assert motion is not None
     return motion
 
@@ -45,7 +45,7 @@ def wrist_scene(name: str, seed: int) -> WristScene:
     return WristScene.by_name(name, WRIST, CAMERAS, HAND, seed)
 
 
-@pytest.mark.parametrize("name", TOGETHER)
+@pytest.mark.parametrize("name", TWO_RIG_SCENES)
 def test_they_are_legal_smooth_and_closed_and_the_wrist_bends(name: str) -> None:
     found = states(motion_of(name))
     angles, wrist_angles = (
@@ -67,7 +67,7 @@ def test_they_are_legal_smooth_and_closed_and_the_wrist_bends(name: str) -> None
     assert (np.ptp(wrist_angles, axis=0) > most * 0.8).all()
 
 
-@pytest.mark.parametrize("name", TOGETHER)
+@pytest.mark.parametrize("name", TWO_RIG_SCENES)
 def test_both_kinds_of_rig_see_one_motion_of_a_seed(name: str) -> None:
     desk = scene_by_name(name, DESK, CAMERAS, HAND, 7)
     wrist = wrist_scene(name, 7)
@@ -85,7 +85,7 @@ def test_both_kinds_of_rig_see_one_motion_of_a_seed(name: str) -> None:
     assert (motion_of(name, 8).at(1.0).angles_rad != motion_of(name).at(1.0).angles_rad).any()
 
 
-@pytest.mark.parametrize("name", TOGETHER)
+@pytest.mark.parametrize("name", TWO_RIG_SCENES)
 def test_the_hand_stays_in_the_picture(name: str) -> None:
     scene = scene_by_name(name, DESK, CAMERAS, HAND, 7)
     for t in np.arange(0.0, scene.period_s, scene.period_s / 150):
@@ -110,7 +110,7 @@ def test_travel_reaches_one_metre_per_second_and_moves_show_every_turn() -> None
 
 
 def test_an_unknown_name_is_none_of_them() -> None:
-    assert together_motion("standard", MODEL, CENTRE, 7) is None
+    assert two_rig_motion("standard", MODEL, CENTRE, 7) is None
 
 
 def test_what_the_imu_of_a_wrist_device_says_is_the_forearms_turn() -> None:
