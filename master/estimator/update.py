@@ -10,7 +10,7 @@ from common.kernels import inner, kernel
 from common.messages import Source
 from master.estimator.covariance import add_second_order, is_small, linear, only_limits, surer, tilts
 from master.estimator.kinematics import angles_of, chains, clamp, free_of, joints, marker_point
-from master.estimator.posterior import Ground, Model, posterior
+from master.estimator.posterior import Ground, Model, Task, posterior
 from master.estimator.priors import PosturePrior
 from master.estimator.problem import (
     EpochPrior,
@@ -217,6 +217,50 @@ def _take_rates(settings: Settings, state: HandState, t_ns: int, shown: Bool, an
         state.rates[a] = rate + share * ((angles[a] - before) / since_s - rate)
 
 
+@inner
+def _begin(state: HandState) -> None:
+    """Forget what was measured: it was another hand."""
+    state.lost_s[0] = state.speed[0] = 0.0
+    for a in range(20):
+        state.rates[a] = 0.0
+    for f in range(5):
+        state.hidden_ns[f] = NEVER_NS
+    for part in range(6):
+        state.measured_ns[part] = NEVER_NS
+
+
+@inner
+def _take_measured(
+    hand: Any, settings: Settings, state: HandState, task: Task, ground: Ground, scan: Any, t_ns: int
+) -> None:
+    """Follow when each part was measured, and of fingers by which level and how surely."""
+    if task.palm_shown[0] > 0:
+        state.measured_ns[PALM_PART] = t_ns
+    for f in range(5):
+        if ground.shown[f]:
+            state.measured_ns[f], state.hidden_ns[f] = t_ns, NEVER_NS
+        pip = 6 + hand.first[f] + 2
+        pip_open = state.cov[pip, pip] > settings.tracked_pip_rad**2
+        if ground.sources[f] > 0:
+            state.solver_mode[f], state.vague[f] = 0, f > 0 and pip_open
+        elif scan.known[f] > 0.0:
+            state.solver_mode[f], state.vague[f] = task.solver_mode[f], task.ambiguous[f] or pip_open
+
+
+@inner
+def _take_rotation(state: HandState, epoch_prior: EpochPrior, search: Search) -> None:
+    """Follow the palm's measured rotation.
+
+    Tilt and heading are as this epoch leaves them, so that what is learnt of these is no motion.
+    """
+    state.measured_rotation_known[0] = epoch_prior.oriented[0] > 0.0
+    if state.measured_rotation_known[0] > 0:
+        sensed_palm(epoch_prior, state.z, search)
+        for i in range(3):
+            for j in range(3):
+                state.measured_rotation[i, j] = search.palm[i, j]
+
+
 @kernel
 def take_over_epoch(
     model: Model, boxed_state: Any, goes_on: bool, observed: Observations, boxed_space: Any, out: Estimate
@@ -237,13 +281,7 @@ def take_over_epoch(
         for f in range(5):
             lost = lost or hidden.gone_s[f] > 0.0
     else:
-        state.lost_s[0] = state.speed[0] = 0.0
-        for a in range(20):
-            state.rates[a] = 0.0
-        for f in range(5):
-            state.hidden_ns[f] = NEVER_NS
-        for part in range(6):  # what was measured was another hand
-            state.measured_ns[part] = NEVER_NS
+        _begin(state)
     if goes_on and lost:
         now = space.scratch.cov
         copy(found.cov, now)
@@ -261,29 +299,12 @@ def take_over_epoch(
         add_second_order(rig, found.palm, state.cov, observed.seen, information, work, scratch, out.cov)
     _depth_noise(settings, state, t_ns, space.ground, space.epoch_prior, out)
     state.t_ns[0], state.known[0], state.natural_weight[0] = t_ns, True, found.natural_weight[0]
-    for f in range(5):
-        if shown[f]:
-            state.measured_ns[f], state.hidden_ns[f] = t_ns, NEVER_NS
-    if palm_shown:
-        state.measured_ns[PALM_PART] = t_ns
     copy(found.palm, state.palm)
     long_s = 10.0
     since_s = dt_s if goes_on else long_s  # what begins owes nothing to an epoch before
     keep_extras(settings, state, since_s, space.epoch_prior, found.z, found.cov, found.scale[0], space.extras)
-    # With tilt and heading as this epoch leaves them, so that what is learnt of these is no motion.
-    state.measured_rotation_known[0] = space.epoch_prior.oriented[0] > 0.0
-    if state.measured_rotation_known[0] > 0:
-        sensed_palm(space.epoch_prior, state.z, space.scratch.search)
-        for i in range(3):
-            for j in range(3):
-                state.measured_rotation[i, j] = space.scratch.search.palm[i, j]
-    for f in range(5):
-        pip = 6 + hand.first[f] + 2
-        pip_open = state.cov[pip, pip] > settings.tracked_pip_rad**2
-        if space.ground.sources[f] > 0:
-            state.solver_mode[f], state.vague[f] = 0, f > 0 and pip_open
-        elif space.scan.known[f] > 0.0:
-            state.solver_mode[f], state.vague[f] = task.solver_mode[f], task.ambiguous[f] or pip_open
+    _take_rotation(state, space.epoch_prior, space.scratch.search)
+    _take_measured(hand, settings, state, task, space.ground, space.scan, t_ns)
     copy(found.palm, out.palm)
     for a in range(20):
         out.angles[a] = state.angles[a] = work.angles[a]

@@ -219,6 +219,86 @@ def _forget(m: int, points: Float, cov: Float, noise: Float) -> None:
     noise[m, :, :] = np.nan
 
 
+class _Scratch(NamedTuple):
+    """Of one marker: what is worked out on the way."""
+
+    ray: Float  # (3,) of the left camera, and `point` (3,) [m] by it
+    point: Float
+    off: Float  # (3,) [m] the point, were the finger tilted
+    aim: Float  # (3,) another direction of the finger
+    bias: Float  # (2, 2) [px] of the centroids
+    shown: (
+        Float  # (2,) area [m^2] that the whole cap shows each camera, and the most of all directions (1, 2)
+    )
+    whole: Float
+    tilted: Float  # (2, 3) standard deviations of the direction
+    by: Float  # (3, 3) derivatives
+
+
+@kernel
+def _cap_spread(
+    tables: DisparityTables,
+    caps: CapTables,
+    uv: Float,
+    m: int,
+    ahead: Float,
+    tilt: Float,
+    work: _Scratch,
+    points: Float,
+    cov: Float,
+) -> None:
+    """Write point and covariance of marker m by radius and direction (3,) of its finger, with `tilt` (3, 3)."""
+    point, off, aim, by, bias = work.point, work.off, work.aim, work.by, work.bias
+    for k in range(3):
+        by[k, 0] = CAPS.radius_share * (point[k] - aim[k])
+    for a in range(3):
+        points[m, a] = point[a]
+        for b in range(3):
+            cov[m, a, b] = by[a, 0] * by[b, 0]
+    _across(ahead, tilt, work.tilted)
+    for t in range(2):
+        length = 0.0
+        for k in range(3):
+            aim[k] = ahead[k] + work.tilted[t, k]
+            length += aim[k] * aim[k]
+        for k in range(3):
+            aim[k] /= sqrt(length)
+        cap_bias(tables, caps, caps.row[m], aim, point, bias, work.shown)
+        for c in range(2):
+            work.whole[0, c] = max(work.whole[0, c], work.shown[c])
+        off[:] = np.nan
+        _place(tables, uv, m, bias, by[2], off)
+        for a in range(3):
+            for b in range(3):
+                cov[m, a, b] += (off[a] - points[m, a]) * (off[b] - points[m, b])
+
+
+@inner
+def _add_noise(
+    tables: DisparityTables,
+    m: int,
+    z: float,
+    left2: float,
+    right2: float,
+    work: _Scratch,
+    cov: Float,
+    noise: Float,
+) -> None:
+    """Add what centroids and law are wrong by: variances of the centroids [px^2], by the derivatives of the point."""
+    ray, by = work.ray, work.by
+    per_px, scale = metres_per_pixel(tables, z), z / tables.focal_px[0]
+    for k in range(3):  # derivatives by u of the left camera, v of it, and u of the right one
+        by[k, 0] = scale * tables.R[k, 0] - per_px * ray[k]
+        by[k, 1] = scale * tables.R[k, 1]
+        by[k, 2] = per_px * ray[k]
+    law2 = (tables.law_error * z) ** 2
+    for a in range(3):
+        for b in range(3):
+            left = left2 * (by[a, 0] * by[b, 0] + by[a, 1] * by[b, 1])
+            noise[m, a, b] = left + right2 * by[a, 2] * by[b, 2]
+            cov[m, a, b] += noise[m, a, b] + law2 * ray[a] * ray[b]
+
+
 @kernel
 def triangulate(
     tables: DisparityTables,
@@ -243,10 +323,12 @@ def triangulate(
         cov, noise: (M, 3, 3) [m^2] covariance and its noise part, written; NaN where the point is.
         outliers: (M,) written: the rows disagree.
     """
-    ray, point, off, aim = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    bias, shown, tilted = np.empty((2, 2)), np.empty(2), np.empty((2, 3))
-    whole, variance, by = np.empty((1, 2)), np.empty(2), np.empty((3, 3))
+    ray, point, aim = np.empty(3), np.empty(3), np.empty(3)
+    bias, whole, variance = np.empty((2, 2)), np.empty((1, 2)), np.empty(2)
     seen_px2, scale_m = np.empty(2), np.empty(2)
+    work = _Scratch(
+        ray, point, np.empty(3), aim, bias, np.empty(2), whole, np.empty((2, 3)), np.empty((3, 3))
+    )
     for m in range(uv.shape[1]):
         _forget(m, points, cov, noise)
         outliers[m] = False
@@ -265,28 +347,7 @@ def triangulate(
             z, rows = _place(tables, uv, m, bias, ray, point)
             if not np.isfinite(z):  # so near that what is seen of the cap is no disparity
                 continue
-            for k in range(3):
-                by[k, 0] = CAPS.radius_share * (point[k] - aim[k])
-            for a in range(3):
-                points[m, a] = point[a]
-                for b in range(3):
-                    cov[m, a, b] = by[a, 0] * by[b, 0]
-            _across(ahead[m], tilt[m], tilted)
-            for t in range(2):
-                length = 0.0
-                for k in range(3):
-                    aim[k] = ahead[m, k] + tilted[t, k]
-                    length += aim[k] * aim[k]
-                for k in range(3):
-                    aim[k] /= sqrt(length)
-                cap_bias(tables, caps, row, aim, point, bias, shown)
-                for c in range(2):
-                    whole[0, c] = max(whole[0, c], shown[c])
-                off[:] = np.nan
-                _place(tables, uv, m, bias, by[2], off)
-                for a in range(3):
-                    for b in range(3):
-                        cov[m, a, b] += (off[a] - points[m, a]) * (off[b] - points[m, b])
+            _cap_spread(tables, caps, uv, m, ahead[m], tilt[m], work, points, cov)
         else:
             anyhow_m2 = (4e-3) ** 2  # of a cap's seen centroid while nothing measures where the finger points
             spread2 = anyhow_m2 if row >= 0 else CAPS.relief_m**2
@@ -302,18 +363,8 @@ def triangulate(
             _forget(m, points, cov, noise)
             outliers[m] = True
             continue
-        per_px, scale = metres_per_pixel(tables, z), z / tables.focal_px[0]
-        for k in range(3):  # derivatives by u of the left camera, v of it, and u of the right one
-            by[k, 0] = scale * tables.R[k, 0] - per_px * ray[k]
-            by[k, 1] = scale * tables.R[k, 1]
-            by[k, 2] = per_px * ray[k]
         left2, right2 = sigma_px[0, m] ** 2 + variance[0], sigma_px[1, m] ** 2 + variance[1]
-        law2 = (tables.law_error * z) ** 2
-        for a in range(3):
-            for b in range(3):
-                left = left2 * (by[a, 0] * by[b, 0] + by[a, 1] * by[b, 1])
-                noise[m, a, b] = left + right2 * by[a, 2] * by[b, 2]
-                cov[m, a, b] += noise[m, a, b] + law2 * ray[a] * ray[b]
+        _add_noise(tables, m, z, left2, right2, work, cov, noise)
         # A point is placed with its covariance, and where its depth is determined (`master.fabrik.rays`).
         if not 4.0 * (cov[m, 0, 0] + cov[m, 1, 1] + cov[m, 2, 2]) < z * z or not np.isfinite(cov[m].sum()):
             _forget(m, points, cov, noise)

@@ -11,6 +11,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+from common.bus.zenoh_bus import ZenohBus
 from common.clock import Clock, SystemClock
 from common.link.datagram import LinkKey
 from common.supervisor import ServiceManager, until
@@ -80,24 +81,11 @@ def run_live(
     dispatcher = Dispatcher(setups, pipelines, stages)
     tuning = RigTuning(settings.files, setups, pipelines, notify, dispatcher)
     with ExitStack() as stack:
-        bus = host_bus(settings.bus, devices_of(setups))
-        stack.callback(bus.close)
-        probe = Probe(bus, clock, always=settings.record is not None)
-        stack.callback(probe.close)
-        if settings.record is not None:
-            recorder = RecorderProcess(
-                settings.record, settings.files, settings.bus, notify, probe.end_always
-            )
-            stack.callback(recorder.close)
-            recorder.wait_ready(bus)
+        bus, probe = _open_bus(stack, setups, settings, clock, notify)
         ingest = ingest_of(setups, key, clock, settings)
         stack.callback(ingest.close)
         load_shedding.waiting = ingest.queue.frame_spans
-        sinks: list[Sink] = [BusSink(bus)]
-        if settings.poses is not None:
-            sinks.append(RunFiles.of(settings.poses, setups))
-        for sink in sinks:
-            stack.callback(sink.close)
+        sinks = _open_sinks(stack, setups, settings, bus)
         monitor = ClockMonitor(setups)
         extrinsics = [ExtrinsicsMonitor(setup.rig.cameras) for setup in setups]
         reporter = Reporter(
@@ -115,8 +103,8 @@ def run_live(
             stop,
             notify,
         )
-        files = FileMonitor(settings.files.calibration, settings.files.rigs)
         writes_to = Path.cwd() if settings.poses is None else settings.poses.parent
+        files = FileMonitor(settings.files.calibration, settings.files.rigs)
         checklist = ChecklistPublisher(
             bus, clock, ingest, setups, pipelines, files, reporter.session, writes_to
         )
@@ -127,17 +115,13 @@ def run_live(
             tuning.renew,
             lambda sender: new_dispatcher([setup for setup in tuning.setups if sender in setup.senders]),
         )
-        threads = (
-            threading.Thread(target=until(stop.is_set, reporter.work), name="master health", daemon=True),
-            threading.Thread(
-                target=until(stop.is_set, lambda: checklist.work(stop, lambda: tuning.setups)),
-                name="master checklist",
-                daemon=True,
-            ),
-        )
         stack.callback(stop.set)  # before anything is closed that a thread uses
-        for thread in threads:
-            thread.start()
+        threads = [
+            _begun("master health", until(stop.is_set, reporter.work)),
+            _begun(
+                "master checklist", until(stop.is_set, lambda: checklist.work(stop, lambda: tuning.setups))
+            ),
+        ]
         for one in dispatcher.unplaced:
             notify(unplaced_line(one.name, one.tracker or ""))
         notify(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
@@ -151,18 +135,63 @@ def run_live(
         stop.set()
         for thread in threads:
             thread.join(2.0)  # a report that hangs on the bus does not keep the run from ending
-        summary: dict[str, object] = {
-            **figures.summary(),
-            "camera_hz": figures.rates.camera_hz,
-            "received_hz": figures.rates.received_hz,
-            "lost": ingest.lost,
-            "skipped": ingest.skipped,
-            "counts": reporter.health().counts,
-            "stage_us": stages.mean_us(),
-        }
+        summary = _summary(figures, ingest, reporter, stages)
     if settings.summary is not None:
         write_summary(settings.summary, summary)
     return summary
+
+
+def _open_bus(
+    stack: ExitStack,
+    setups: Sequence[RigSetup],
+    settings: LiveSettings,
+    clock: Clock,
+    notify: Callable[[str], None],
+) -> tuple[ZenohBus, Probe]:
+    """Open the bus, the probe of what is taken, and the recorder's process, if there is to be one."""
+    bus = host_bus(settings.bus, devices_of(setups))
+    stack.callback(bus.close)
+    probe = Probe(bus, clock, always=settings.record is not None)
+    stack.callback(probe.close)
+    if settings.record is not None:
+        recorder = RecorderProcess(settings.record, settings.files, settings.bus, notify, probe.end_always)
+        stack.callback(recorder.close)
+        recorder.wait_ready(bus)
+    return bus, probe
+
+
+def _open_sinks(
+    stack: ExitStack, setups: Sequence[RigSetup], settings: LiveSettings, bus: ZenohBus
+) -> list[Sink]:
+    """Open all that takes poses: the bus, and files if wanted."""
+    sinks: list[Sink] = [BusSink(bus)]
+    if settings.poses is not None:
+        sinks.append(RunFiles.of(settings.poses, setups))
+    for sink in sinks:
+        stack.callback(sink.close)
+    return sinks
+
+
+def _begun(name: str, work: Callable[[], None]) -> threading.Thread:
+    """Start a thread that does not keep the process from ending."""
+    thread = threading.Thread(target=work, name=name, daemon=True)
+    thread.start()
+    return thread
+
+
+def _summary(
+    figures: RunFigures, ingest: Ingest, reporter: Reporter, stages: StageTimes
+) -> dict[str, object]:
+    """The figures of a run that is over."""
+    return {
+        **figures.summary(),
+        "camera_hz": figures.rates.camera_hz,
+        "received_hz": figures.rates.received_hz,
+        "lost": ingest.lost,
+        "skipped": ingest.skipped,
+        "counts": reporter.health().counts,
+        "stage_us": stages.mean_us(),
+    }
 
 
 def cameras_of(setups: Sequence[RigSetup]) -> tuple[str, ...]:
