@@ -32,215 +32,173 @@ def _setting(value: float, unit: str, low: float, high: float, source: str) -> f
     return field(default=value, metadata={"range": Range(unit, low, high, source)})
 
 
+def _deg(value_deg: float, low_rad: float, high_rad: float, source: str) -> float:
+    """Declare an angle [rad] by its value in degrees."""
+    return _setting(radians(value_deg), "rad", low_rad, high_rad, source)
+
+
+def _number(value: float, low: float, high: float, source: str) -> float:
+    """Declare a number without a unit."""
+    return _setting(value, "1", low, high, source)
+
+
+def _s(value: float, low: float, high: float, source: str) -> float:
+    """Declare a time [s]."""
+    return _setting(value, "s", low, high, source)
+
+
+def _m(value: float, low: float, high: float, source: str) -> float:
+    """Declare a length [m]."""
+    return _setting(value, "m", low, high, source)
+
+
+def _gate(value: float, low: float, high: float, source: str) -> float:
+    """Declare a gate on a chi square."""
+    return _setting(value, "chi square", low, high, source)
+
+
 @dataclass(frozen=True, slots=True)
 class Settings:
     """The estimator's settings."""
 
+    # fmt: off
     # Posture prior of a natural hand: standard deviations and means of its angles.
-    abduction_rad: float = _setting(radians(7.0), "rad", 0.01, 1.0, _HANDS)
-    natural_flexion_rad: float = _setting(radians(14.0), "rad", 0.01, 2.0, _HANDS)
-    neighbour_flexion_rad: float = _setting(radians(30.0), "rad", 0.01, 3.0, _HANDS)
-    neighbour_pip_rad: float = _setting(radians(35.0), "rad", 0.01, 3.0, _HANDS)
-    pip_rad: float = _setting(radians(50.0), "rad", 0.01, 3.0, _HANDS)
-    pip_mean_rad: float = _setting(radians(12.0), "rad", 0.0, 1.5, _HANDS)
-    loose_dip_rad: float = _setting(radians(15.0), "rad", 0.01, 1.0, _HANDS)
-    loose_dip_per_pip: float = _setting(2.0 / 3.0, "1", 0.0, 1.5, "Kalbfleisch: DIP = 2/3 PIP")
-    thumb_rad: float = _setting(radians(20.0), "rad", 0.01, 2.0, _HANDS)
-    thumb_abduction_mean_rad: float = _setting(radians(8.0), "rad", -1.0, 1.0, _HANDS)
-    thumb_flexion_mean_rad: float = _setting(radians(8.0), "rad", -1.0, 1.0, _HANDS)
-    thumb_mcp_mean_rad: float = _setting(radians(10.0), "rad", -1.0, 1.0, _HANDS)
-    thumb_ip_mean_rad: float = _setting(radians(15.0), "rad", -1.0, 1.0, _HANDS)
+    abduction_rad: float = _deg(7.0, 0.01, 1.0, _HANDS)
+    natural_flexion_rad: float = _deg(14.0, 0.01, 2.0, _HANDS)
+    neighbour_flexion_rad: float = _deg(30.0, 0.01, 3.0, _HANDS)
+    neighbour_pip_rad: float = _deg(35.0, 0.01, 3.0, _HANDS)
+    pip_rad: float = _deg(50.0, 0.01, 3.0, _HANDS)
+    pip_mean_rad: float = _deg(12.0, 0.0, 1.5, _HANDS)
+    loose_dip_rad: float = _deg(15.0, 0.01, 1.0, _HANDS)
+    loose_dip_per_pip: float = _number(2.0 / 3.0, 0.0, 1.5, "Kalbfleisch: DIP = 2/3 PIP")
+    thumb_rad: float = _deg(20.0, 0.01, 2.0, _HANDS)
+    thumb_abduction_mean_rad: float = _deg(8.0, -1.0, 1.0, _HANDS)
+    thumb_flexion_mean_rad: float = _deg(8.0, -1.0, 1.0, _HANDS)
+    thumb_mcp_mean_rad: float = _deg(10.0, -1.0, 1.0, _HANDS)
+    thumb_ip_mean_rad: float = _deg(15.0, -1.0, 1.0, _HANDS)
     # A free hand, which has none: flexions anywhere within limits, a PIP rather in the lower half of its range.
-    free_pip_rad: float = _setting(radians(40.0), "rad", 0.1, 3.0, _HANDS)
-    free_pip_mean_rad: float = _setting(radians(30.0), "rad", 0.0, 1.5, _HANDS)
-    natural_prior_weight: float = _setting(
-        1.0 / 3.0, "1", 0.01, 0.99, "small: posture priors that fit win by their narrowness"
-    )
-    posture_widened: float = _setting(
-        3.0, "1", 1.0, 10.0, "by which a measured posture is wider of a hand that defies it"
-    )
+    free_pip_rad: float = _deg(40.0, 0.1, 3.0, _HANDS)
+    free_pip_mean_rad: float = _deg(30.0, 0.0, 1.5, _HANDS)
+    natural_prior_weight: float = _number(1.0 / 3.0, 0.01, 0.99,
+        "small: posture priors that fit win by their narrowness")
+    posture_widened: float = _number(3.0, 1.0, 10.0,
+        "by which a measured posture is wider of a hand that defies it")
     # A finger that was never seen is curled out of sight: a stretched one would show.
-    curled_rad: float = _setting(radians(15.0), "rad", 0.01, 1.5, _HANDS)
-    curled_flexion_rad: float = _setting(radians(65.0), "rad", 0.0, 1.6, _HANDS)
-    curled_pip_rad: float = _setting(radians(88.0), "rad", 0.0, 1.9, _HANDS)
-    curled_thumb_abduction_rad: float = _setting(radians(20.0), "rad", -1.0, 1.0, _HANDS)
-    curled_thumb_flexion_rad: float = _setting(radians(30.0), "rad", -1.0, 1.0, _HANDS)
-    curled_thumb_mcp_rad: float = _setting(radians(25.0), "rad", -1.0, 1.5, _HANDS)
-    curled_thumb_ip_rad: float = _setting(radians(30.0), "rad", -1.0, 1.5, _HANDS)
-    shows_rad: float = _setting(
-        radians(45.0), "rad", 0.1, 3.0, "a finger bent by less in all its joints shows its end from behind"
-    )
+    curled_rad: float = _deg(15.0, 0.01, 1.5, _HANDS)
+    curled_flexion_rad: float = _deg(65.0, 0.0, 1.6, _HANDS)
+    curled_pip_rad: float = _deg(88.0, 0.0, 1.9, _HANDS)
+    curled_thumb_abduction_rad: float = _deg(20.0, -1.0, 1.0, _HANDS)
+    curled_thumb_flexion_rad: float = _deg(30.0, -1.0, 1.0, _HANDS)
+    curled_thumb_mcp_rad: float = _deg(25.0, -1.0, 1.5, _HANDS)
+    curled_thumb_ip_rad: float = _deg(30.0, -1.0, 1.5, _HANDS)
+    shows_rad: float = _deg(45.0, 0.1, 3.0, "a finger bent by less in all its joints shows its end from behind")
     # What is wrong with markers, bones and caps.
-    back_normal_rad: float = _setting(
-        radians(22.0), "rad", 0.05, 1.5, "a marker on the back that is seen well faces the cameras"
-    )
-    bones_m: float = _setting(1.0e-3, "m", 1e-4, 1e-2, "bones and caps are known to about 1 mm")
+    back_normal_rad: float = _deg(22.0, 0.05, 1.5, "a marker on the back that is seen well faces the cameras")
+    bones_m: float = _m(1.0e-3, 1e-4, 1e-2, "bones and caps are known to about 1 mm")
     # How far a hand that is seen moves in a time, as a random walk: wide, so that what is seen decides.
     process_noise_rad_s: float = _setting(8.0, "rad/s", 0.5, 50.0, _HANDS)
     palm_process_noise_rad_s: float = _setting(2.5, "rad/s", 0.1, 50.0, _HANDS)
-    palm_held_rad_s: float = _setting(
-        0.9, "rad/s", 0.05, 50.0, "with a hidden thumb little determines how the palm turns"
-    )
+    palm_held_rad_s: float = _setting(0.9, "rad/s", 0.05, 50.0,
+        "with a hidden thumb little determines how the palm turns")
     palm_process_noise_m_s: float = _setting(2.0, "m/s", 0.05, 20.0, _HANDS)
-    shortest_s: float = _setting(1e-3, "s", 1e-5, 1e-2, "a shorter step would weld the hand to its last pose")
-    component_memory_s: float = _setting(
-        0.3, "s", 0.0, 5.0, "how fast a hand may change from posture priors to none"
-    )
+    shortest_s: float = _s(1e-3, 1e-5, 1e-2, "a shorter step would weld the hand to its last pose")
+    component_memory_s: float = _s(0.3, 0.0, 5.0, "how fast a hand may change from posture priors to none")
     # Fingers that nobody sees.
-    coast_s: float = _setting(0.16, "s", 0.01, 1.0, _COORDINATION)
-    rate_memory_s: float = _setting(0.024, "s", 1e-3, 1.0, "half of a new rate counts at 60 frames a second")
-    growth_rad: float = _setting(radians(36.0), "rad", 0.05, 2.0, _GROWTH)
-    growth_aside_rad: float = _setting(radians(14.0), "rad", 0.02, 2.0, _GROWTH)
-    growth_thumb_rad: float = _setting(radians(20.0), "rad", 0.02, 2.0, _GROWTH)
-    growth_s: float = _setting(1.0, "s", 0.05, 10.0, _GROWTH)
-    alike: float = _setting(0.7, "1", 0.0, 0.99, _COORDINATION)
-    held_rad: float = _setting(radians(3.0), "rad", 0.001, 0.5, "a finger that was just lost")
+    coast_s: float = _s(0.16, 0.01, 1.0, _COORDINATION)
+    rate_memory_s: float = _s(0.024, 1e-3, 1.0, "half of a new rate counts at 60 frames a second")
+    growth_rad: float = _deg(36.0, 0.05, 2.0, _GROWTH)
+    growth_aside_rad: float = _deg(14.0, 0.02, 2.0, _GROWTH)
+    growth_thumb_rad: float = _deg(20.0, 0.02, 2.0, _GROWTH)
+    growth_s: float = _s(1.0, 0.05, 10.0, _GROWTH)
+    alike: float = _number(0.7, 0.0, 0.99, _COORDINATION)
+    held_rad: float = _deg(3.0, 0.001, 0.5, "a finger that was just lost")
     # A palm without markers.
     lost_rotation_rad_s: float = _setting(radians(20.0), "rad/s", 0.01, 5.0, _HANDS)
     lost_shift_m_s: float = _setting(0.02, "m/s", 0.001, 1.0, _HANDS)
-    lost_goes_on: float = _setting(0.35, "1", 0.0, 2.0, "share of its speed, along each axis")
-    speed_memory_s: float = _setting(
-        0.047, "s", 1e-3, 1.0, "three tenths of a new one count at 60 frames a second"
-    )
+    lost_goes_on: float = _number(0.35, 0.0, 2.0, "share of its speed, along each axis")
+    speed_memory_s: float = _s(0.047, 1e-3, 1.0, "three tenths of a new one count at 60 frames a second")
     # One camera alone: perspective constrains depth poorly, so it is held.
-    held_depth_m: float = _setting(0.004, "m", 1e-4, 0.1, "a step of depth of a hand that one camera sees")
-    unobserved_depth_m_s: float = _setting(
-        0.08, "m/s", 0.001, 1.0, "simulated hands that one camera saw: 20 to 30 mm off after 0.6 s"
-    )
-    unobserved_depth_most_m: float = _setting(0.15, "m", 0.01, 1.0, "as far as the volume goes")
+    held_depth_m: float = _m(0.004, 1e-4, 0.1, "a step of depth of a hand that one camera sees")
+    unobserved_depth_m_s: float = _setting(0.08, "m/s", 0.001, 1.0,
+        "simulated hands that one camera saw: 20 to 30 mm off after 0.6 s")
+    unobserved_depth_most_m: float = _m(0.15, 0.01, 1.0, "as far as the volume goes")
     # Both hypotheses.
-    certain: float = _setting(12.0, "1", 1.0, 50.0, "log odds that count as certain")
-    negligible: float = _setting(0.03, "1", 0.0, 0.5, "weight of a hypothesis that changes next to nothing")
-    noticed: float = _setting(
-        0.15, "1", 0.0, 1.0, "of one of less weight the likeliest hand is taken, not its mean"
-    )
-    stiff: float = _setting(
-        1e-2, "1", 1e-6, 1.0, "how much less than the markers the mean of hypotheses holds"
-    )
+    certain: float = _number(12.0, 1.0, 50.0, "log odds that count as certain")
+    negligible: float = _number(0.03, 0.0, 0.5, "weight of a hypothesis that changes next to nothing")
+    noticed: float = _number(0.15, 0.0, 1.0, "of one of less weight the likeliest hand is taken, not its mean")
+    stiff: float = _number(1e-2, 1e-6, 1.0, "how much less than the markers the mean of hypotheses holds")
     # Covariance.
-    claimed: float = _setting(
-        1.0, "1", 0.1, 100.0, "observations that the widths of posture priors count as; Kass, Wasserman 1995"
-    )
-    straight_rad: float = _setting(
-        radians(3.0), "rad", 0.0, 1.0, "a turn by less is 0.2 mm off the tangent at the far end of a hand"
-    )
+    claimed: float = _number(1.0, 0.1, 100.0,
+        "observations that the widths of posture priors count as; Kass, Wasserman 1995")
+    straight_rad: float = _deg(3.0, 0.0, 1.0,
+        "a turn by less is 0.2 mm off the tangent at the far end of a hand")
     rotation_most_rad: float = _setting(1.0, "rad", 0.1, 3.0, "a turn less sure leads nowhere farther")
     # Gates.
-    marker_gate: float = _setting(16.3, "chi square", 5.0, 50.0, _CHI + " of three numbers, 1 in 1000")
-    misled: float = _setting(
-        32.6, "chi square", 5.0, 200.0, "twice that: another hand explains the markers better"
-    )
-    forget_s: float = _setting(
-        0.5, "s", 0.05, 10.0, "after so long without a marker nothing is known of the hand"
-    )
-    tracked_m: float = _setting(
-        0.022, "m", 0.002, 0.1, "half the largest axis of the 95 % region of a joint that is TRACKED"
-    )
-    tracked_pip_rad: float = _setting(
-        radians(15.0), "rad", 0.02, 1.0, "standard deviation of the PIP of a finger that is TRACKED"
-    )
-    tracked_age_s: float = _setting(
-        0.03, "s", 0.0, 1.0, "how old the newest measurement of a TRACKED finger may be"
-    )
-    tracked_cycle_s: float = _setting(
-        0.055, "s", 0.0, 1.0, "the same where a wrist device measured it, whose strobe cycles come at 30 Hz"
-    )
+    marker_gate: float = _gate(16.3, 5.0, 50.0, _CHI + " of three numbers, 1 in 1000")
+    misled: float = _gate(32.6, 5.0, 200.0, "twice that: another hand explains the markers better")
+    forget_s: float = _s(0.5, 0.05, 10.0, "after so long without a marker nothing is known of the hand")
+    tracked_m: float = _m(0.022, 0.002, 0.1,
+        "half the largest axis of the 95 % region of a joint that is TRACKED")
+    tracked_pip_rad: float = _deg(15.0, 0.02, 1.0, "standard deviation of the PIP of a finger that is TRACKED")
+    tracked_age_s: float = _s(0.03, 0.0, 1.0, "how old the newest measurement of a TRACKED finger may be")
+    tracked_cycle_s: float = _s(0.055, 0.0, 1.0,
+        "the same where a wrist device measured it, whose strobe cycles come at 30 Hz")
     # What is shown.
-    blend_s: float = _setting(0.1, "s", 0.01, 1.0, "as long as a leap is seen as a motion")
+    blend_s: float = _s(0.1, 0.01, 1.0, "as long as a leap is seen as a motion")
     # Fingers that a wrist device sees.
-    dip_rad: float = _setting(
-        radians(3.0), "rad", 0.005, 1.0, "of a DIP about its share of the PIP, of straight fingers"
-    )
-    dip_share: float = _setting(0.13, "1", 0.01, 1.0, "and by so much of the PIP more; the papers' ratios")
-    coupled_rad: float = _setting(
-        radians(5.0), "rad", 0.005, 1.0, "of a natural MCP about its share of the PIP, of straight fingers"
-    )
-    coupled_spread: float = _setting(
-        0.2, "1", 0.0, 1.0, "share of the PIP besides, of a hand of which nothing is known"
-    )
-    coupled_fingers: float = _setting(
-        60.0, "1", 1.0, 1e5, "half bent fingers seen that this counts as, once each strobe cycle"
-    )
-    coupled_s: float = _setting(60.0, "s", 1.0, 3600.0, "as long as a hand keeps to its own share")
-    thumb_coupled_rad: float = _setting(
-        radians(12.0), "rad", 0.01, 1.0, "of a thumb's IP about what goes with its MCP"
-    )
-    natural_finger_weight: float = _setting(0.8, "1", 0.01, 0.99, "hands before anything of them is seen")
-    straight_pip_rad: float = _setting(
-        radians(10.0), "rad", 0.02, 1.0, "by which fingers are bent that are stretched"
-    )
-    unseen: float = _setting(
-        2.3, "1", 0.0, 10.0, "log odds against a pose whose fingertip would be seen, and is not"
-    )
-    unseen_again: float = _setting(
-        0.7, "1", 0.0, 10.0, "the same of a finger that was seen a moment ago: misses come in rows"
-    )
-    parted: float = _setting(0.4, "1", 0.05, 0.95, "of the lower top, between two parts of a density")
-    other_part: float = _setting(0.05, "1", 0.001, 0.5, "less probability than this is no other part")
-    branch_rad: float = _setting(
-        radians(95.0), "rad", 0.5, 2.5, "PIP beyond which a laser point on the last phalanx fits two poses"
-    )
-    goes_on_rad: float = _setting(
-        radians(8.0), "rad", 0.02, 2.0, "by which a PIP may have moved at least since the finger was seen"
-    )
-    near_rad: float = _setting(
-        radians(32.0), "rad", 0.1, 3.0, "about its last PIP in which a finger that is well known is searched"
-    )
-    search_again: float = _setting(6.0, "1", 1.0, 100.0, "strobe cycles after which all is searched")
-    hinge_rad: float = _setting(
-        radians(4.0), "rad", 0.001, 0.5, "by which real hinges lie askew to those of a hand file"
-    )
-    refused: float = _setting(
-        14.0, "chi square", 4.0, 100.0, "of laser point and fingertip of a finger, beside any pose"
-    )
-    refused_unlit: float = _setting(
-        8.0, "chi square", 3.0, 100.0, "the same where the light of the fingertip fits no pose"
-    )
-    contrary: float = _setting(
-        30.0,
-        "chi square",
-        5.0,
-        200.0,
-        "of a palm against the IMU on the forearm, beside any bend and heading",
-    )
-    light_rad: float = _setting(
-        0.045, "1", 0.01, 1.0, "of a distance by light: skin inclined by 25 degrees looks 5 % farther"
-    )
-    light_share: float = _setting(
-        0.15,
-        "1",
-        0.0,
-        1.0,
-        "of what distances by light measure, used to fit their unit: fingers err together",
-    )
-    teaching_gate: float = _setting(
-        5.0, "chi square", 1.0, 100.0, "of laser point and fingertip of a finger that teaches nothing"
-    )
-    led_scale: float = _setting(3.0, "1", 0.1, 10.0, "of the unit's logarithm, which may be any")
-    flexion_rad: float = _setting(radians(14.0), "rad", 0.01, 1.5, "of wrists; Palmer et al. 1985")
-    deviation_rad: float = _setting(radians(11.0), "rad", 0.01, 1.5, "of wrists; Palmer et al. 1985")
-    calibrated_palm_rad: float = _setting(
-        radians(1.0), "rad", 0.001, 0.5, "of a palm that was calibrated before its device"
-    )
-    wrist_share: float = _setting(
-        0.6, "1", 0.0, 1.0, "of what fingers measure of the wrist's bend: they err together"
-    )
-    strap_rad: float = _setting(
-        radians(1.5), "rad", 0.001, 0.5, "of a palm by markers, and of how IMU and camera are mounted"
-    )
+    dip_rad: float = _deg(3.0, 0.005, 1.0, "of a DIP about its share of the PIP, of straight fingers")
+    dip_share: float = _number(0.13, 0.01, 1.0, "and by so much of the PIP more; the papers' ratios")
+    coupled_rad: float = _deg(5.0, 0.005, 1.0,
+        "of a natural MCP about its share of the PIP, of straight fingers")
+    coupled_spread: float = _number(0.2, 0.0, 1.0,
+        "share of the PIP besides, of a hand of which nothing is known")
+    coupled_fingers: float = _number(60.0, 1.0, 1e5,
+        "half bent fingers seen that this counts as, once each strobe cycle")
+    coupled_s: float = _s(60.0, 1.0, 3600.0, "as long as a hand keeps to its own share")
+    thumb_coupled_rad: float = _deg(12.0, 0.01, 1.0, "of a thumb's IP about what goes with its MCP")
+    natural_finger_weight: float = _number(0.8, 0.01, 0.99, "hands before anything of them is seen")
+    straight_pip_rad: float = _deg(10.0, 0.02, 1.0, "by which fingers are bent that are stretched")
+    unseen: float = _number(2.3, 0.0, 10.0, "log odds against a pose whose fingertip would be seen, and is not")
+    unseen_again: float = _number(0.7, 0.0, 10.0,
+        "the same of a finger that was seen a moment ago: misses come in rows")
+    parted: float = _number(0.4, 0.05, 0.95, "of the lower top, between two parts of a density")
+    other_part: float = _number(0.05, 0.001, 0.5, "less probability than this is no other part")
+    branch_rad: float = _deg(95.0, 0.5, 2.5,
+        "PIP beyond which a laser point on the last phalanx fits two poses")
+    goes_on_rad: float = _deg(8.0, 0.02, 2.0,
+        "by which a PIP may have moved at least since the finger was seen")
+    near_rad: float = _deg(32.0, 0.1, 3.0,
+        "about its last PIP in which a finger that is well known is searched")
+    search_again: float = _number(6.0, 1.0, 100.0, "strobe cycles after which all is searched")
+    hinge_rad: float = _deg(4.0, 0.001, 0.5, "by which real hinges lie askew to those of a hand file")
+    refused: float = _gate(14.0, 4.0, 100.0, "of laser point and fingertip of a finger, beside any pose")
+    refused_unlit: float = _gate(8.0, 3.0, 100.0, "the same where the light of the fingertip fits no pose")
+    contrary: float = _gate(30.0, 5.0, 200.0,
+        "of a palm against the IMU on the forearm, beside any bend and heading")
+    light_rad: float = _number(0.045, 0.01, 1.0,
+        "of a distance by light: skin inclined by 25 degrees looks 5 % farther")
+    light_share: float = _number(0.15, 0.0, 1.0,
+        "of what distances by light measure, used to fit their unit: fingers err together")
+    teaching_gate: float = _gate(5.0, 1.0, 100.0,
+        "of laser point and fingertip of a finger that teaches nothing")
+    led_scale: float = _number(3.0, 0.1, 10.0, "of the unit's logarithm, which may be any")
+    flexion_rad: float = _deg(14.0, 0.01, 1.5, "of wrists; Palmer et al. 1985")
+    deviation_rad: float = _deg(11.0, 0.01, 1.5, "of wrists; Palmer et al. 1985")
+    calibrated_palm_rad: float = _deg(1.0, 0.001, 0.5, "of a palm that was calibrated before its device")
+    wrist_share: float = _number(0.6, 0.0, 1.0,
+        "of what fingers measure of the wrist's bend: they err together")
+    strap_rad: float = _deg(1.5, 0.001, 0.5, "of a palm by markers, and of how IMU and camera are mounted")
     wrist_rate_1_s: float = _setting(1.5, "1/s", 0.1, 30.0, "of wrists; Hansson et al. 2009")
-    wrist_mean_s: float = _setting(20.0, "s", 1.0, 600.0, "as long as a posture of the wrist is kept")
-    tilt_s: float = _setting(5.0, "s", 0.1, 600.0, "as long as an IMU has the vertical off")
-    errs_s: float = _setting(0.5, "s", 0.01, 60.0, "as long as errors of shape and skin stay")
-    wrist_errs_s: float = _setting(
-        0.05, "s", 0.001, 60.0, "as long as errors of a palm by markers stay, of what a wrist moves meanwhile"
-    )
+    wrist_mean_s: float = _s(20.0, 1.0, 600.0, "as long as a posture of the wrist is kept")
+    tilt_s: float = _s(5.0, 0.1, 600.0, "as long as an IMU has the vertical off")
+    errs_s: float = _s(0.5, 0.01, 60.0, "as long as errors of shape and skin stay")
+    wrist_errs_s: float = _s(0.05, 0.001, 60.0,
+        "as long as errors of a palm by markers stay, of what a wrist moves meanwhile")
     # The search.
     tolerance: float = _setting(1e-7, "half chi square", 1e-12, 1.0, "what a step may leave")
-    tolerance_share: float = _setting(1e-4, "1", 0.0, 0.1, "of the cost, likewise")
-    coarse: float = _setting(
-        1e-2, "half chi square", 1e-7, 1.0, "where one of several starts is to be chosen"
-    )
+    tolerance_share: float = _number(1e-4, 0.0, 0.1, "of the cost, likewise")
+    coarse: float = _setting(1e-2, "half chi square", 1e-7, 1.0, "where one of several starts is to be chosen")
+    # fmt: on
 
     @classmethod
     def ranges(cls) -> dict[str, Range]:
