@@ -50,25 +50,12 @@ def camera_path(camera: str) -> str:
 def blueprint(setups: Sequence[RigSetup], *, live: bool, with_truth: bool) -> rrb.Blueprint:
     """Return the layout; plots follow the last 10 s of a live run, or show all."""
     cameras = {name: camera for setup in setups for name, camera in setup.cameras.items()}
-    rate_hz = max(camera.frame_rate_hz for camera in cameras.values())  # of the fastest
-    with_markers = any(setup.has_markers for setup in setups)
-    with_wrist = any(setup.has_markers and setup.wrist is not None for setup in setups)
     hidden = [f"- {WORLD}/hand/{setup.hand.profile.name}/uncertainty" for setup in setups]
     plot_span_s = 10.0
     span = rrb.VisibleTimeRange(
         TIMELINE,
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-plot_span_s),
         end=rrb.TimeRangeBoundary.cursor_relative(),
-    )
-    position, target = (_eye_of(setups), _TARGET_M) if with_markers else (_WRIST_EYE_M, _WRIST_TARGET_M)
-    eye = rrb.EyeControls3D(position=position, look_target=target, eye_up=(0.0, -1.0, 0.0))
-    scene = rrb.Spatial3DView(
-        origin="/",  # above the world: a wrist device's is turned as the forearm is held
-        contents=f"{WORLD}/**",
-        name="Hand and rig",
-        background=_BACKGROUND,
-        line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=eye,
     )
     views = [
         rrb.Spatial2DView(
@@ -79,25 +66,7 @@ def blueprint(setups: Sequence[RigSetup], *, live: bool, with_truth: bool) -> rr
         )
         for name in cameras
     ]
-    rejected = {name for name, there in (
-        ("plots/jitter_mm", with_markers), ("plots/error_mm", with_truth), ("plots/wrist_angles_deg", with_wrist),
-        ("plots/contact_mm", any(setup.objects for setup in setups)),
-    ) if not there}  # fmt: skip
-    rows = [
-        (n, p, (0.0, 1.25 * rate_hz) if n == _RATE else r, several)
-        for n, p, r, several in _PLOTS
-        if p not in rejected
-    ]
-    plots = [
-        rrb.TimeSeriesView(
-            origin=path,
-            name=name,
-            time_ranges=span if live else None,
-            axis_y=None if fixed is None else rrb.ScalarAxis(range=fixed),
-            plot_legend=rrb.PlotLegend(visible=several, corner=rrb.Corner2D.LeftTop),
-        )
-        for name, path, fixed, several in rows
-    ]
+    plots = _plots(setups, span if live else None, with_truth=with_truth)
     legend_view = rrb.TextDocumentView(origin="about", name="Colours")
     events = rrb.TextLogView(origin=EVENTS, name="Events")
     tabs = rrb.Tabs(*plots[-_TABS:], events, legend_view, active_tab=0)
@@ -108,7 +77,9 @@ def blueprint(setups: Sequence[RigSetup], *, live: bool, with_truth: bool) -> rr
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(
-                scene, rrb.Grid(*views, grid_columns=min(len(views), cameras_a_row)), row_shares=[3, 2]
+                _scene_view(setups),
+                rrb.Grid(*views, grid_columns=min(len(views), cameras_a_row)),
+                row_shares=[3, 2],
             ),
             rrb.Vertical(tabs, *plots[:-_TABS], lanes, row_shares=[1.5] + [1] * (len(plots) - _TABS) + [1.4]),
             column_shares=[3, 2],
@@ -117,6 +88,50 @@ def blueprint(setups: Sequence[RigSetup], *, live: bool, with_truth: bool) -> rr
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
     )
+
+
+def _scene_view(setups: Sequence[RigSetup]) -> rrb.Spatial3DView:
+    """Everything in space, from where all of it is in the picture."""
+    with_markers = any(setup.has_markers for setup in setups)
+    position, target = (_eye_of(setups), _TARGET_M) if with_markers else (_WRIST_EYE_M, _WRIST_TARGET_M)
+    eye = rrb.EyeControls3D(position=position, look_target=target, eye_up=(0.0, -1.0, 0.0))
+    return rrb.Spatial3DView(
+        origin="/",  # above the world: a wrist device's is turned as the forearm is held
+        contents=f"{WORLD}/**",
+        name="Hand and rig",
+        background=_BACKGROUND,
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=eye,
+    )
+
+
+def _plots(
+    setups: Sequence[RigSetup], span: rrb.VisibleTimeRange | None, *, with_truth: bool
+) -> list[rrb.TimeSeriesView]:
+    """The plots of what these rigs have, over `span`, or over all."""
+    cameras = [camera for setup in setups for camera in setup.cameras.values()]
+    rate_hz = max(camera.frame_rate_hz for camera in cameras)  # of the fastest
+    with_markers = any(setup.has_markers for setup in setups)
+    with_wrist = any(setup.has_markers and setup.wrist is not None for setup in setups)
+    rejected = {name for name, there in (
+        ("plots/jitter_mm", with_markers), ("plots/error_mm", with_truth), ("plots/wrist_angles_deg", with_wrist),
+        ("plots/contact_mm", any(setup.objects for setup in setups)),
+    ) if not there}  # fmt: skip
+    rows = [
+        (n, p, (0.0, 1.25 * rate_hz) if n == _RATE else r, several)
+        for n, p, r, several in _PLOTS
+        if p not in rejected
+    ]
+    return [
+        rrb.TimeSeriesView(
+            origin=path,
+            name=name,
+            time_ranges=span,
+            axis_y=None if fixed is None else rrb.ScalarAxis(range=fixed),
+            plot_legend=rrb.PlotLegend(visible=several, corner=rrb.Corner2D.LeftTop),
+        )
+        for name, path, fixed, several in rows
+    ]
 
 
 def _eye_of(setups: Sequence[RigSetup]) -> tuple[float, float, float]:

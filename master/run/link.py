@@ -79,6 +79,24 @@ PENDING_NS = 1_000_000_000  # a hello whose slave never confirms is forgotten
 SILENT_NS = 1_000_000_000
 
 
+def _check_names(
+    cameras: tuple[str, ...], imus: tuple[str, ...], wrists: tuple[str, ...], trackers: tuple[str, ...]
+) -> None:
+    """Refuse senders with one name for two, or too many; ValueError."""
+    everybody = {*cameras, *imus, *trackers}
+    if not cameras or not len(everybody) <= MAX_CAMERAS:
+        raise ValueError(f"{len(everybody)} cameras, IMUs and trackers, expected 1 to {MAX_CAMERAS}")
+    for one, ones, other, others in (
+        ("a camera", cameras, "an IMU", imus),
+        ("a camera", cameras, "a tracker", trackers),
+        ("an IMU", imus, "a tracker", trackers),
+    ):
+        if both := set(ones) & set(others):
+            raise ValueError(f"{min(both)!r} is {one} and {other}")
+    if strange := set(wrists) - set(cameras):
+        raise ValueError(f"{min(strange)!r} of a wrist device is none of the cameras")
+
+
 class MasterLink:
     """Sessions of the rig's senders, the moment of the start, counts of refusals."""
 
@@ -106,18 +124,7 @@ class MasterLink:
             ValueError: Key of wrong length, no camera, more than 32 senders, one name for two kinds of
                 sender, or a wrist's camera that is none of the cameras.
         """
-        everybody = {*cameras, *imus, *trackers}
-        if not cameras or not len(everybody) <= MAX_CAMERAS:
-            raise ValueError(f"{len(everybody)} cameras, IMUs and trackers, expected 1 to {MAX_CAMERAS}")
-        for one, ones, other, others in (
-            ("a camera", cameras, "an IMU", imus),
-            ("a camera", cameras, "a tracker", trackers),
-            ("an IMU", imus, "a tracker", trackers),
-        ):
-            if both := set(ones) & set(others):
-                raise ValueError(f"{min(both)!r} is {one} and {other}")
-        if strange := set(wrists) - set(cameras):
-            raise ValueError(f"{min(strange)!r} of a wrist device is none of the cameras")
+        _check_names(cameras, imus, wrists, trackers)
         self._keys, self._clock, self._random = RigKeys(key), clock, random
         self._beacon_to, self._zenoh_endpoint = beacon_to, zenoh_endpoint
         self._start_timeout_ns = start_timeout_ns
