@@ -44,7 +44,7 @@ class HeldPoses:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Course:
+class Trajectory:
     """A motion by where the hand is at each time [s]."""
 
     where: Callable[[float], HandState]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bench.played import START_NS, Course, message_of
+from bench.played import START_NS, Trajectory, message_of
 from bench.report import CALIBRATION, Row, rig_files, rms
 from common.arrays import Float
 from common.hand.model import HandModel
@@ -58,7 +58,7 @@ def static(setup: RigSetup, place: int, frames: int = _FRAMES) -> Static:
     centre[2] = AWAY_M
     pose = base_pose(model, centre, rng.uniform(-0.004, 0.004, 3), np.zeros(3))
     # The finger tips lie nearer than the middle of the hand: move it until its caps are at the distance on average.
-    resting = Course(lambda _t_s: HandState(pose, angles))
+    resting = Trajectory(lambda _t_s: HandState(pose, angles))
     caps = model.marker_points(model.forward(pose, angles), rig.markers)
     pose[2, 3] += AWAY_M - float(caps[:, 2].mean())
     scene = Scene(rig, setup.cameras, model, resting, centre, (), seed=place)

@@ -14,7 +14,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from bench.played import START_NS, Course, Watched, solve, watch
+from bench.played import START_NS, Trajectory, Watched, solve, watch
 from bench.report import CALIBRATION, Row, chi_squares, inside, rig_files
 from common.arrays import Bool, Float
 from common.geometry.camera_model import CameraModel
@@ -281,7 +281,7 @@ def _errors(name: str, found: Sequence[Outcome], note: str) -> Row:
     return Row(f"{name}: p95", max(p95), "%", f"{spread}; {note}; p95 by offset {by_offset}")
 
 
-def _swing(setup: RigSetup) -> Course:
+def _swing(setup: RigSetup) -> Trajectory:
     """The resting posture moved along x; the speed at the middle is SPEED_M_S."""
     angles = angles_of(setup.hand, np.array(REST, np.float64), np.zeros((5, 4)))
 
@@ -289,7 +289,7 @@ def _swing(setup: RigSetup) -> Course:
         shift = np.array([_AMPLITUDE_M * np.sin(SPEED_M_S / _AMPLITUDE_M * t_s), 0.0, 0.0])
         return HandState(base_pose(setup.hand, view_centre(setup.rig), shift, np.zeros(3)), angles)
 
-    return Course(where, 2.0 * np.pi * _AMPLITUDE_M / SPEED_M_S)
+    return Trajectory(where, 2.0 * np.pi * _AMPLITUDE_M / SPEED_M_S)
 
 
 @cache
@@ -301,7 +301,7 @@ def _scene(rate_hz: float) -> tuple[RigSetup, Scene]:
 
 
 @cache
-def _monitored(rate_hz: float, offset_s: float) -> tuple[Watched, ...]:
+def _detected(rate_hz: float, offset_s: float) -> tuple[Watched, ...]:
     setup, scene = _scene(rate_hz)
     times = np.arange(round(0.9 * rate_hz)) / rate_hz
     return tuple(watch(scene, name, times + c * offset_s) for c, name in enumerate(setup.rig.cameras))
@@ -310,7 +310,7 @@ def _monitored(rate_hz: float, offset_s: float) -> tuple[Watched, ...]:
 def rendered(rate_hz: float, offset_s: float, treatment: Treatment) -> Float:
     """Return errors of depth [%] of all caps of a rendered swing at all moments, before the filter."""
     setup, scene = _scene(rate_hz)
-    watched = _monitored(rate_hz, offset_s)
+    watched = _detected(rate_hz, offset_s)
     if treatment == "predict":
         setup = replace(setup, rig=msgspec.structs.replace(setup.rig, frame_sync="predict"))
     if treatment == "uncorrected":  # the k-th frame with the k-th of the other camera

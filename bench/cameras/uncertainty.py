@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from bench.played import HOLD_S, MOVE_S, START_NS, Course, HeldPoses, observed, times_of
+from bench.played import HOLD_S, MOVE_S, START_NS, HeldPoses, Trajectory, observed, times_of
 from bench.report import CALIBRATION, Row, chi_squares, inside, joined, rig_files
 from common.arrays import Float
 from common.calibration import HandProfile
@@ -41,7 +41,7 @@ def _stills(model: HandModel, centre: Float, seed: int) -> HeldPoses:
     return HeldPoses(model, held)
 
 
-def _sideways(model: HandModel, centre: Float, seed: int) -> Course:
+def _sideways(model: HandModel, centre: Float, seed: int) -> Trajectory:
     """Each of the six poses on a sine along the baseline, 1 m/s at most; a seed for each."""
     rng = np.random.default_rng(seed)
     posture = np.array(POSES[list(POSES)[seed % len(POSES)]], np.float64)
@@ -53,7 +53,7 @@ def _sideways(model: HandModel, centre: Float, seed: int) -> Course:
         shift = np.array([np.sin(rate * max(t_s, 0.0)) / rate, 0.0, 0.0])
         return HandState(base_pose(model, middle, shift, rotation), angles)
 
-    return Course(where, 1e6)
+    return Trajectory(where, 1e6)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

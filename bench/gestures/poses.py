@@ -128,7 +128,7 @@ def _by_markers(number: int) -> dict[str, RecognisedPoses]:
     four = _setup("desk4")
     who = _person(number, four)
     motion = StudyPoses(HandModel.of(who.hand), view_centre(four.rig), _MOTION + number)
-    messages = _monitored(Scene.of_motion(four.rig, four.cameras, who.hand, motion, _MOTION + number))
+    messages = _detected(Scene.of_motion(four.rig, four.cameras, who.hand, motion, _MOTION + number))
     return {name: _found(_known(_setup(name), who), messages, motion) for name in ("desk", "desk4")}
 
 
@@ -146,7 +146,7 @@ def _by_both(number: int) -> dict[str, RecognisedPoses]:
     device = WristScene(true, worn.cameras, model, motion, seed=seed, reflectance=who.reflectance)
     alone = _known(marked, who)
     both = Both("both-poses", seed, scene, device, alone, RigSetup.of(file, worn.cameras, alone.hand))
-    markers = _monitored(scene)
+    markers = _detected(scene)
     messages = in_order([*markers, *orientations(both, _SECONDS), *cycles_of(both, _SECONDS)[0]])
     return {
         "desk-back3": _found(alone, markers, posed),
@@ -154,7 +154,7 @@ def _by_both(number: int) -> dict[str, RecognisedPoses]:
     }
 
 
-def _monitored(scene: Scene) -> list[Observed]:
+def _detected(scene: Scene) -> list[Observed]:
     times = {camera: times_of(scene, camera, _SECONDS, _RATE_HZ) for camera in scene.rig.cameras}
     return in_order([m for camera, t in times.items() for m in found_by(scene, camera, t)])
 

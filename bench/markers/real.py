@@ -177,7 +177,7 @@ class Collector:
             self._rows.append((tuple(evidence), float(found.quality[m]), right, source))
         return found
 
-    def look_at_photo(self, photo: Photo, rng: np.random.Generator, *, enlarged: bool = True) -> None:
+    def look_at_photo(self, photo: Photo, rng: np.random.Generator, *, enlarged: bool) -> None:
         """Look at a photograph without paint, and at it and its parts by other cameras; then paint it."""
         ranges = shipped()
         nowhere = np.zeros(len(ranges))
@@ -211,7 +211,7 @@ class Collector:
                         for seen in (image, as_by_another_camera(image, rng)):
                             self.look("rendered", seen, ranges, place, radius)
 
-    def look_at_ball(self, rng: np.random.Generator, clicks: int, *, other: bool = True) -> None:
+    def look_at_ball(self, rng: np.random.Generator, clicks: int, *, other: bool) -> None:
         """Look at a real ball with colours of one click each."""
         marked, images = ball()
         for ranges in clicked_ranges(marked, images, rng, clicks):
@@ -227,13 +227,16 @@ class Collector:
         return {row.name: row.range for row in calibrate(image, {name: clicks[name] for name in SIX})}
 
 
-def collected(seed: int = 1) -> Rows:
-    """Return everything there is to fit to."""
-    collector, rng = Collector(), np.random.default_rng(seed)
+def collected(rng: np.random.Generator, clicks: int, *, changed: bool) -> Rows:
+    """Return everything found in photographs, with and without markers, in renderings and of the ball.
+
+    `changed`: also in parts of the photographs, and of the ball as by other cameras: what weights are fitted to.
+    """
+    collector = Collector()
     for photo in photos():
-        collector.look_at_photo(photo, rng)
+        collector.look_at_photo(photo, rng, enlarged=changed)
     collector.look_at_rendered(rng)
-    collector.look_at_ball(rng, 6)
+    collector.look_at_ball(rng, clicks, other=changed)
     return collector.rows()
 
 
@@ -351,7 +354,7 @@ def rows() -> Iterator[Row]:
         note = f"95 % {np.nanpercentile(ratio, 95):.1f}; goal 3"
         yield Row(f"ball, {name}: in its sigma", float(np.nanmedian(ratio)), "sigma", note)
         yield Row(f"ball, {name}: found", share, "%", f"of {len(error)}")
-    seen = looked_at(rng)
+    seen = collected(rng, 2, changed=False)
     plain_photo = np.array([source.startswith("photo ") for source in seen.source])
     count = max(sum(seen.photos.values()), 1)
     likely = float((seen.quality[plain_photo] > _LIKELY).sum()) / count
@@ -384,16 +387,6 @@ def ball_errors(colour: HsvRange) -> tuple[Float, Float, Float]:
     return error, ratio, plain
 
 
-def looked_at(rng: np.random.Generator) -> Rows:
-    """Return everything found in photographs, with and without markers, in renderings and of the ball."""
-    collector = Collector()
-    for photo in photos():
-        collector.look_at_photo(photo, rng, enlarged=False)
-    collector.look_at_rendered(rng)
-    collector.look_at_ball(rng, 2, other=False)
-    return collector.rows()
-
-
 def _plain(image: Image, colour: HsvRange) -> Float:
     hsv = cv2.cvtColor(image, cv2.COLOR_BGR2HSV)
     mask = cv2.inRange(hsv, np.array(colour.hsv_low), np.array(colour.hsv_high))
@@ -411,14 +404,14 @@ def main(arguments: Sequence[str]) -> None:
         "--held-out", default="", metavar="SOURCE,...", help="photographs to leave out of the fit"
     )
     held = set(parser.parse_args(arguments).held_out.split(",")) - {""}
-    every = collected()
-    apart = np.array([source.split()[-1] in held for source in every.source])
-    beta = fit(every.of(~apart))
+    every = collected(np.random.default_rng(1), 6, changed=True)
+    held_out = np.array([source.split()[-1] in held for source in every.source])
+    beta = fit(every.of(~held_out))
     print(f"BIAS = {beta[0]:.2f}\nWEIGHTS = Evidence(")
     for name, weight in zip(Evidence._fields, beta[1:].tolist(), strict=True):
         print(f"    {name}={weight:.2f},")
     print(")")
-    for title, chosen in (("fitted to", ~apart), ("held out", apart)):
+    for title, chosen in (("fitted to", ~held_out), ("held out", held_out)):
         if chosen.any():
             part = every.of(chosen)
             p = 1.0 / (1.0 + np.exp(-np.clip(beta[0] + part.evidence @ beta[1:], -30.0, 30.0)))

@@ -75,14 +75,14 @@ def stretch(name: str, seed: int, start_s: float, seconds: float) -> Outcome:
     profile = load(CALIBRATION / f"objects/{name}.json", ObjectProfile)
     models = {c: CameraModel.of(file, rig.camera_pose(c)) for c, file in cameras.items()}
     scene = scene_by_name("object", rig, cameras, hand, seed, {name: profile})
-    messages, seen = _monitored(scene, profile, start_s, seconds)
+    messages, seen = _detected(scene, profile, start_s, seconds)
     line = ObjectLine(profile, rig, models)
     poses = [solved.pose for message in messages for solved in line.push(message)]
     poses += [solved.pose for solved in line.flush()]
     return _judged(poses, scene, Features.of(profile, rig.markers), models, seen, name)
 
 
-def _monitored(
+def _detected(
     scene: Scene, profile: ObjectProfile, start_s: float, seconds: float
 ) -> tuple[list[MarkerDetections | TagDetections], Seen]:
     """What the slaves of all cameras would send, in order, and what there was to be seen."""
