@@ -65,6 +65,17 @@ def test_a_routine_from_a_file_of_poses(tmp_path: Path, root: Path) -> None:
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+def test_poses_with_the_markers_of_another_rig_are_refused(tmp_path: Path, root: Path) -> None:
+    arrays = {
+        "t_ns": np.arange(3),
+        "markers_raw_m": np.zeros((3, 8, 3)),
+        "markers_cov_m2": np.zeros((3, 8, 3, 3)),
+    }
+    write_npz(tmp_path / "poses.npz", arrays)
+    with pytest.raises(RecordingError, match=r"the rig needs \(3, 6, 3\): name its rig"):
+        run("--poses", str(tmp_path / "poses.npz"), "--calibration", str(root / "calib_json"))
+
+
 def test_the_steps_are_printed_without_anything_else() -> None:
     output = run("--steps")
     assert "lay the back of the hand" in output.lower()

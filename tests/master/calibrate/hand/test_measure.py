@@ -10,7 +10,7 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import Couplings, HandProfile
-from common.errors import FitError
+from common.errors import CalibrationError, FitError
 from common.hand.model import CHAINS, FINGERS, HandModel
 from common.hand.profiles import generated_profile
 from common.hand.routine import ROUTINE_S
@@ -159,6 +159,37 @@ def test_a_short_recording_is_refused() -> None:
     points[run.t_ns > 8e9] = np.nan
     with pytest.raises(FitError, match=f"over 8.0 s, the routine takes {ROUTINE_S:.0f} s"):
         seen(run, "right", points)
+
+
+def test_few_poses_a_second_are_refused() -> None:
+    run = refused(26, "right")
+    points = run.points_m.copy()
+    points[::2] = np.nan
+    with pytest.raises(FitError, match=r"seen 10\.0 times a second, 15 are needed"):
+        seen(run, "right", points)
+
+
+def test_what_is_no_number_was_not_seen() -> None:
+    run = refused(26, "right")
+    with pytest.raises(FitError, match=r"seen over 0\.0 s"):
+        seen(run, "right", np.full_like(run.points_m, np.nan))
+    points = run.points_m.copy()
+    points[:, 3] = np.inf
+    with pytest.raises(FitError, match="'ring' is seen in 0 %"):
+        seen(run, "right", points)
+
+
+def test_markers_of_another_set_are_refused() -> None:
+    run = refused(26, "right")
+    names = ("thumb", "index", "middle", "ring", "elbow", "back")
+    with pytest.raises(CalibrationError, match=r"no marker of the rig .* on the tip of 'pinky"):
+        Observed.of(run.t_ns, run.points_m, run.cov_m2, names, HandModel.of(template("right")))
+
+
+def test_a_hand_that_does_nothing_is_refused() -> None:
+    run = refused(26, "right")
+    with pytest.raises(FitError, match=r"follow the steps|the routine is not complete"):
+        measure_hand(seen(run, "right", np.tile(run.points_m[5], (len(run.t_ns), 1, 1))), template("right"))
 
 
 def test_a_palm_that_moves_is_refused() -> None:
