@@ -1,35 +1,22 @@
 """Whose a part of the laser line is, where the palm is not quite where calibration found it, or the seams are wrong."""
 
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
 from bench.both.scene import Both
-from common.arrays import Image
 from common.geometry.transforms import rotation_vector_to_matrix
 from common.sim.wrist.render import WristRenderer
-from common.sim.wrist.scene import WristTruth
-from slave.cameras.synthetic import STROBE
 from slave.wrist.laser import finger_labels, laser_lines, separate
 from slave.wrist.led_image import WristView
 from slave.wrist.runs import NONE, lines
-from slave.wrist.strobe import lit
 from slave.wrist.workspace import workspace_of
-from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW, scene
+from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW, Seen, scene, seen_at
 
 VISIBLE_M = 2e-3
 NEAR_PX = 10.0
-
-
-class Seen(NamedTuple):
-    """Differences of laser and LED frame to the ambient one, and the truth."""
-
-    laser: Image
-    led: Image
-    truth: WristTruth
 
 
 @cache
@@ -37,11 +24,7 @@ def seen(name: str) -> list[Seen]:
     """A scene at nine times."""
     one = scene(name, 61)
     device = WristRenderer(one, "wrist", 2)
-    out: list[Seen] = []
-    for t in np.linspace(1.0, 58.0, 9).tolist():
-        ambient, laser, led = (device.render(t, kind) for kind in STROBE)
-        out.append(Seen(lit(laser, ambient), lit(led, ambient), one.truth(t)))
-    return out
+    return [seen_at(one, device, t) for t in np.linspace(1.0, 58.0, 9).tolist()]
 
 
 @cache
@@ -92,10 +75,9 @@ def test_lines_of_a_palm_that_deviates_and_holds_something_are_counted_from_the_
     view = WristView.of(both.wrist.rig, both.wrist.cameras[name], both.wrist.hand.profile)
     device = WristRenderer(both.wrist_scene, name, 2)
     for t in (4.9, 5.1, 17.0):
-        truth = both.wrist_scene.truth(t)
-        ambient, laser, led = (device.render(t, kind) for kind in STROBE)
-        fingers = separate(lit(led, ambient), view)
+        laser, led, truth = seen_at(both.wrist_scene, device, t)
+        fingers = separate(led, view)
         assert abs(np.degrees(truth.wrist_angles_rad[1])) > 5.0
         assert fingers.palm_pose.straight
-        found = laser_lines(lit(laser, ambient), fingers, view).uv[1:]
+        found = laser_lines(laser, fingers, view).uv[1:]
         assert (np.linalg.norm(found - truth.laser_uv[2:6], axis=1) < NEAR_PX).all()

@@ -14,10 +14,11 @@ from common.arrays import Bool, Float, Image
 from common.calibration import HandProfile, load
 from common.hand.model import CHAINS
 from common.hand.profiles import generated_profile, mirrored_profile
-from common.recording.frame_recording import Illumination, open_recording
+from common.recording.frame_recording import open_recording
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from slave.cameras.replay import read_png
+from slave.cameras.synthetic import STROBE
 from slave.sources import Frame
 from slave.wrist.fingertips import Fingertips, fingertips
 from slave.wrist.laser import laser_lines, separate
@@ -49,8 +50,7 @@ def shown(name: str, seed: int, hand: str = "default", count: int = 10) -> list[
     renderer = WristRenderer(scene, "wrist")
     out: list[Shown] = []
     for t in np.linspace(0.1, 0.98 * scene.period_s, count).tolist():
-        illuminations = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
-        ambient, laser, led = (renderer.render(t, kind) for kind in illuminations)
+        ambient, laser, led = (renderer.render(t, kind) for kind in STROBE)
         truth = scene.truth(t)
         out.append(Shown(ambient, laser, led, truth.tip_uv, truth.tip_visible))
     return out

@@ -14,7 +14,7 @@ from slave.wrist.laser import Fingers, laser_lines, separate
 from slave.wrist.runs import lines
 from slave.wrist.strobe import lit
 from slave.wrist.workspace import workspace_of
-from tests.slave.wrist.wrist_frames import VIEW, renderer, scene
+from tests.slave.wrist.wrist_frames import VIEW, renderer, scene, seen_at
 
 BLACK = np.zeros((480, 640), dtype=np.uint8)
 INDEX = 1
@@ -133,10 +133,8 @@ def test_a_thumb_whose_line_runs_on_over_its_ball_is_met_within_half_a_finger_wi
     one, device = scene("poses@indoor", 31), renderer("poses@indoor", 31)
     off: list[float] = []
     for k in range(16):
-        t = one.period_s * k / 16
-        ambient, laser, led = (device.render(t, kind) for kind in STROBE)
-        found = laser_lines(lit(laser, ambient), separate(lit(led, ambient), VIEW), VIEW)
-        truth = one.truth(t)
+        laser, led, truth = seen_at(one, device, one.period_s * k / 16)
+        found = laser_lines(laser, separate(led, VIEW), VIEW)
         if truth.laser_len_vis[1] >= VISIBLE_M:
             off.append(float(np.linalg.norm(VIEW.on_plane(found.uv)[0] - truth.laser_pt[1])))
             assert not (np.abs(found.uv[0] - truth.laser_uv[1]) > 3.0 * found.sigma_px[0]).any()
@@ -151,10 +149,8 @@ def laser_errors(name: str, count: int, seed: int) -> tuple[Float, float]:
     out = np.full((count, 4), np.nan)
     seen = np.zeros((count, 4), dtype=np.bool_)
     for k in range(count):
-        t = one.period_s * k / count
-        ambient, laser, led = (device.render(t, kind) for kind in STROBE)
-        found = laser_lines(lit(laser, ambient), separate(lit(led, ambient), VIEW), VIEW)
-        truth = one.truth(t)
+        laser, led, truth = seen_at(one, device, one.period_s * k / count)
+        found = laser_lines(laser, separate(led, VIEW), VIEW)
         seen[k] = truth.laser_len_vis[2:6] >= 2e-3
         out[k] = np.linalg.norm(VIEW.on_plane(found.uv) - truth.laser_pt[1:6], axis=1)[1:]
     out[~seen] = np.nan

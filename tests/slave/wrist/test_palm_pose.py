@@ -2,24 +2,22 @@
 
 from dataclasses import replace
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from common.arrays import Float, Image
+from common.arrays import Float
 from common.hand.wrist import STRAIGHT
 from common.sim.motion import FIST, REST, HandMotion, HandState, angles_of
 from common.sim.wrist.render import WristRenderer
-from common.sim.wrist.scene import WristScene, WristTruth
-from slave.cameras.synthetic import STROBE
+from common.sim.wrist.scene import WristScene
 from slave.sources import Frame
 from slave.wrist.detector import find
 from slave.wrist.laser import laser_lines, separate
 from slave.wrist.led_image import shrink
 from slave.wrist.palm_pose import find_palm_pose, prepare, rotated_view, wrist_angles_seen
-from slave.wrist.strobe import StrobeCycle, lit
-from tests.slave.wrist.wrist_frames import VIEW, scene
+from slave.wrist.strobe import StrobeCycle
+from tests.slave.wrist.wrist_frames import VIEW, Seen, scene, seen_at
 
 WRIST_ANGLES = ((22.0, -8.0), (-16.0, 8.0), (0.0, 12.0), (0.0, -12.0), (12.0, 8.0), (-15.0, -8.0))
 FLEXION_DEG, DEVIATION_DEG = 8.0, 2.5  # of error; between two fingers there are about 12 degrees
@@ -40,14 +38,6 @@ class Held:
         return self._state
 
 
-class Seen(NamedTuple):
-    """Differences of frames to the ambient one, and the truth."""
-
-    laser: Image
-    led: Image
-    truth: WristTruth
-
-
 @cache
 def seen(wrist_deg: tuple[float, float], curled: float = 0.1, seed: int = 5) -> Seen:
     """A hand between rest (0) and fist (1)."""
@@ -55,9 +45,7 @@ def seen(wrist_deg: tuple[float, float], curled: float = 0.1, seed: int = 5) -> 
     rest, fist = np.array(REST, dtype=np.float64), np.array(FIST, dtype=np.float64)
     angles = angles_of(whole.model, rest + curled * (fist - rest), np.zeros((5, 4)))
     held: WristScene = replace(whole, motion=Held(whole.motion, angles, np.radians(wrist_deg)))
-    renderer = WristRenderer(held, "wrist", 2)
-    ambient, laser, led = (renderer.render(0.0, kind) for kind in STROBE)
-    return Seen(lit(laser, ambient), lit(led, ambient), held.truth(0.0))
+    return seen_at(held, WristRenderer(held, "wrist", 2), 0.0)
 
 
 @pytest.mark.parametrize("wrist_angles", WRIST_ANGLES)

@@ -2,16 +2,19 @@
 
 from functools import cache, lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
 
+from common.arrays import Image
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.sim.wrist.render import WristRenderer
-from common.sim.wrist.scene import WristScene
+from common.sim.wrist.scene import WristScene, WristTruth
 from slave.cameras.synthetic import STROBE
 from slave.sources import Frame
 from slave.wrist.led_image import WristView
+from slave.wrist.strobe import lit
 
 ROOT = Path(__file__).resolve().parents[3]
 RIG = load(ROOT / "calib_json/rigs/wrist.json", RigCalibration)
@@ -29,9 +32,9 @@ def strobed(name: str, cycles: int, seed: int = 7, start_s: float = 0.0) -> tupl
 
 @cache
 def _frame(name: str, seed: int, start_s: float, seq: int) -> Frame:
-    t_ns, lit = FIRST_NS + round(seq * PERIOD_NS), STROBE[seq % 3]
-    image = renderer(name, seed).render(start_s + (t_ns - FIRST_NS) * 1e-9, lit)
-    return Frame(seq, t_ns, t_ns + 4_000_000, image, lit, 1000.0)
+    t_ns, kind = FIRST_NS + round(seq * PERIOD_NS), STROBE[seq % 3]
+    image = renderer(name, seed).render(start_s + (t_ns - FIRST_NS) * 1e-9, kind)
+    return Frame(seq, t_ns, t_ns + 4_000_000, image, kind, 1000.0)
 
 
 @cache
@@ -44,6 +47,20 @@ def scene(name: str, seed: int = 7) -> WristScene:
 def renderer(name: str, seed: int = 7) -> WristRenderer:
     """What draws that scene; to make it takes as long as twenty frames."""
     return WristRenderer(scene(name, seed), "wrist")
+
+
+class Seen(NamedTuple):
+    """Differences of laser and LED frame of one instant to the ambient one, and the truth."""
+
+    laser: Image
+    led: Image
+    truth: WristTruth
+
+
+def seen_at(one: WristScene, device: WristRenderer, t_s: float) -> Seen:
+    """What a device shows at scene time `t_s` [s]."""
+    ambient, laser, led = (device.render(t_s, kind) for kind in STROBE)
+    return Seen(lit(laser, ambient), lit(led, ambient), one.truth(t_s))
 
 
 def spoiled(frames: tuple[Frame, ...], rng: np.random.Generator, share: float) -> list[Frame]:
