@@ -1,6 +1,5 @@
 """A file is replaced whole or not at all."""
 
-import os
 from pathlib import Path
 
 import pytest
@@ -34,24 +33,3 @@ def test_a_block_that_fails_leaves_the_old_file_alone(error: type[BaseException]
         begin_and_fail()
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_disk_that_is_full_at_the_end_leaves_the_old_file_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "x.json"
-    path.write_bytes(b"old")
-
-    def full(_descriptor: int) -> None:
-        raise OSError("full")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="full"), replacing(path) as file:
-        file.write(b"new")
-    assert path.read_bytes() == b"old"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_missing_folder_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError), replacing(tmp_path / "none" / "x.json"):
-        pass
