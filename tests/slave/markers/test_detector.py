@@ -159,13 +159,6 @@ def test_an_empty_frame_finds_nothing_and_noise_is_nothing() -> None:
         assert np.isnan(found.quality).all()
 
 
-def test_the_same_frames_give_the_same_bytes() -> None:
-    images = [render(hand(200.0 + 9.0 * k), noise=2.0, seed=k) for k in range(4)]
-    for a, b in zip(push_all(images), push_all(images), strict=True):
-        assert a.uv.tobytes() == b.uv.tobytes()
-        assert a.quality.tobytes() == b.quality.tobytes()
-
-
 def test_a_frame_of_another_size_or_kind_is_refused() -> None:
     with pytest.raises(ValueError, match="camera file says"):
         DETECTOR.fresh().push(np.zeros((240, 320, 3), np.uint8), 0)
