@@ -4,19 +4,18 @@ Colours are those of the camera files, calibrated once under 4300 K; what is fou
 the light of calibration.
 """
 
-from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
-from common.arrays import Float, Image
+from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.sim.light import CALIBRATED_KELVIN, LightSchedule
 from common.sim.render import Renderer
 from common.sim.scene import Scene
-from slave.markers.detector import Detections, MarkerDetector
+from slave.markers.detector import MarkerDetector
 from slave.markers.illuminant import gain_difference
 from slave.markers.reloadable import LightAdaptiveDetector
 from slave.markers.white_balance import Inline
@@ -47,7 +46,7 @@ SWITCHED = LightSchedule(
 CANDLE = LightSchedule(((1.0, 4300.0, 1.0), (9.0, 2000.0, 1.0)))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Outcome:
     """What became of the markers under one course of the light.
 
@@ -55,52 +54,22 @@ class Outcome:
         visible: ImageObservations to be had: markers at least half visible, over all frames.
         found: How many were found.
         swaps: Reports of a marker on the place of another one.
-        wrong: All reports that are on no visible part of their marker, swaps included.
         swaps_unwarned: Swaps before the first warning.
         missed_unwarned: ImageObservations missed before the first warning.
-        apart: Largest error of the estimated light in log gains of red or blue against green, after the first second.
-        refused: Frames in which nothing was reported.
+        gain_difference: Largest error of the estimated light in log gains of red or blue against green, after the first second.
     """
 
-    visible: int
-    found: int
-    swaps: int
-    wrong: int
-    swaps_unwarned: int
-    missed_unwarned: int
-    apart: float
-    refused: int
-
-    def __add__(self, other: "Outcome") -> "Outcome":
-        return Outcome(
-            self.visible + other.visible,
-            self.found + other.found,
-            self.swaps + other.swaps,
-            self.wrong + other.wrong,
-            self.swaps_unwarned + other.swaps_unwarned,
-            self.missed_unwarned + other.missed_unwarned,
-            max(self.apart, other.apart),
-            self.refused + other.refused,
-        )
-
-    @property
-    def share(self) -> float:
-        """Found of those visible."""
-        return self.found / self.visible
+    visible: int = 0
+    found: int = 0
+    swaps: int = 0
+    swaps_unwarned: int = 0
+    missed_unwarned: int = 0
+    gain_difference: float = 0.0
 
 
-class Detector(Protocol):
-    """What is judged."""
-
-    def push(self, image: Image, t_ns: int) -> Detections:
-        """Detect in one frame."""
-        ...
-
-
-@lru_cache(maxsize=2)
-def _renderer(course: LightSchedule, seed: int, camera: str) -> Renderer:
-    """Of the standard scene under this course of the light."""
-    return Renderer(replace(standard_scene(seed), light=course), camera)
+@cache
+def _renderer(seed: int, camera: str) -> Renderer:
+    return Renderer(standard_scene(seed), camera)
 
 
 @cache
@@ -112,42 +81,41 @@ def outcome(
     follow: bool = True,
     seconds: float = SECONDS,
     begin_s: float = 0.0,
+    rate_hz: float = 0.5 * RATE_HZ,
 ) -> Outcome:
     """Judge one camera on one course; deterministic."""
-    renderer, scene = _renderer(course, seed, camera), standard_scene(seed)
+    renderer, scene = _renderer(seed, camera), standard_scene(seed)
     model = scene.cameras[camera]
     following = LightAdaptiveDetector(model, scene.rig.markers, Inline()) if follow else None
-    detector: Detector = MarkerDetector(model, scene.rig.markers) if following is None else following
-    got, warned = Outcome(0, 0, 0, 0, 0, 0, 0.0, 0), False
-    for k in range(round(seconds * RATE_HZ)):
-        t_s = begin_s + k / RATE_HZ
-        image, truth = renderer.observe(t_s)
+    detector = MarkerDetector(model, scene.rig.markers) if following is None else following
+    got, warned = Outcome(), False
+    for k in range(round(seconds * rate_hz)):
+        t_s = begin_s + k / rate_hz
+        gains_bgr = course.at(t_s).gains_bgr()
+        image, truth = renderer.exposed(model.exposure_us, gains_bgr).observe(t_s)
         found = detector.push(image, round(t_s * 1e9))
         seen, visible = np.isfinite(found.uv[:, 0]), truth.visible >= VISIBLE
-        allowed = np.maximum(FREE_PX, np.sqrt(truth.area / np.pi))
-        swaps, wrong = _misplaced(found.uv, truth.uv, allowed)
-        light = 0.0
+        swaps = _swaps(found.uv, truth.uv, np.maximum(FREE_PX, np.sqrt(truth.area / np.pi)))
+        got.visible += int(visible.sum())
+        got.found += int((visible & seen).sum())
+        got.swaps += swaps
         if following is not None:
             warned = warned or bool(following.warnings)
-            if k >= RATE_HZ:
-                light = gain_difference(following.log_gains, np.log(course.at(t_s).gains_bgr()), dim=0.0)
-        missed = int((visible & ~seen).sum())
-        unwarned = (0, 0) if warned else (swaps, missed)
-        got += Outcome(int(visible.sum()), int((visible & seen).sum()), swaps, wrong, *unwarned, light, 0)
-    return replace(got, refused=0 if following is None else following.refused)
+            if k >= rate_hz:
+                got.gain_difference = max(got.gain_difference, gain_difference(following.log_gains, np.log(gains_bgr), dim=0.0))
+        if not warned:
+            got.swaps_unwarned += swaps
+            got.missed_unwarned += int((visible & ~seen).sum())
+    return got
 
 
-def _misplaced(uv: Float, truth: Float, allowed: Float) -> tuple[int, int]:
-    """How many reports lie on another marker, and how many not on their own."""
-    swaps = wrong = 0
+def _swaps(uv: Float, truth: Float, allowed: Float) -> int:
+    """How many reports lie on another marker and not on their own."""
+    swaps = 0
     for m in np.flatnonzero(np.isfinite(uv[:, 0])):
-        connection_lost = np.hypot(*(truth - uv[m]).T)
-        if connection_lost[m] <= allowed[m]:
-            continue
-        wrong += 1
-        others = np.delete(connection_lost <= allowed, m)
-        swaps += bool(others.any())
-    return swaps, wrong
+        on = np.hypot(*(truth - uv[m]).T) <= allowed
+        swaps += bool(on.any() and not on[m])
+    return swaps
 
 
 @cache

@@ -46,25 +46,26 @@ MARKERS = load_rig().markers
 )
 def test_markers_stay_found_and_themselves(schedule: LightSchedule, seed: int, camera: str) -> None:
     got = outcome(schedule, seed, camera)
-    assert got.visible > 1000
+    assert got.visible > 500
     assert got.swaps == 0
     assert got.found >= 0.99 * outcome(STILL, seed, camera).found
     assert got.apart < 0.06
 
 
 def test_without_following_the_same_light_swaps_markers() -> None:
-    assert outcome(RAMP, 5, "left", follow=False, seconds=6.0).swaps > 50
+    assert outcome(RAMP, 5, "left", follow=False, seconds=6.0).swaps > 25
 
 
 @pytest.mark.parametrize("kelvin", [3000.0, 6500.0])
 @pytest.mark.parametrize("exposure", [0.7, 1.3])
 def test_a_start_under_another_light_swaps_nothing_unwarned(kelvin: float, exposure: float) -> None:
     for begin_s in (0.0, 4.0, 15.0):  # an open hand, fists, a hand that shows few markers
-        got = outcome(LightSchedule(((0.0, kelvin, exposure),)), 7, "left", seconds=1.5, begin_s=begin_s)
+        schedule = LightSchedule(((0.0, kelvin, exposure),))
+        got = outcome(schedule, 7, "left", seconds=1.5, begin_s=begin_s, rate_hz=RATE_HZ)
         assert got.swaps_unwarned == 0
         if begin_s == 0.0:
             assert got.swaps == 0
-            assert got.found >= 0.98 * outcome(STILL, 7, "left", seconds=1.5).found
+            assert got.found >= 0.98 * outcome(STILL, 7, "left", seconds=1.5, rate_hz=RATE_HZ).found
 
 
 def test_a_light_out_of_bounds_is_warned_of_before_it_costs_a_marker() -> None:
