@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from master.rig.setup import load_setup
 _STEP_NS = 10_000_000
 
 
+@cache
 def piece() -> Piece:
     """A fifth of a second of the standard scene."""
     desk = load_setup(CALIBRATION, DESK)

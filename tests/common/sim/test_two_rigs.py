@@ -1,5 +1,6 @@
 """Motions before both kinds of rig: legal, smooth, closed, one and the same for both; the IMU feels their forearm."""
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from common.hand.model import HandModel
 from common.hand.wrist import forearm_palm
 from common.imu.fusion import OrientationFilter
 from common.sim.motion import HandMotion, HandState
-from common.sim.scene import view_centre
+from common.sim.scene import Scene, view_centre
 from common.sim.scenes import scene_by_name
 from common.sim.sensors import SimulatedImu
 from common.sim.two_rigs import TWO_RIG_SCENES, two_rig_motion
@@ -31,23 +32,32 @@ MOST_WRIST_DEG = {"grasp": (10.0, 8.0), "both-moves": (25.0, 12.0), "gestures": 
 RATE_HZ = 100
 
 
+@cache
 def motion_of(name: str, seed: int = 7) -> HandMotion:
     motion = two_rig_motion(name, MODEL, CENTRE, seed)
     assert motion is not None
     return motion
 
 
-def states(motion: HandMotion) -> list[HandState]:
+@cache
+def states(name: str) -> list[HandState]:
+    motion = motion_of(name)
     return [motion.at(k / RATE_HZ) for k in range(round(motion.period_s * RATE_HZ))]
 
 
-def wrist_scene(name: str, seed: int) -> WristScene:
-    return WristScene.by_name(name, WRIST, CAMERAS, HAND, seed)
+@cache
+def desk_scene(name: str) -> Scene:
+    return scene_by_name(name, DESK, CAMERAS, HAND, 7)
+
+
+@cache
+def wrist_scene(name: str) -> WristScene:
+    return WristScene.by_name(name, WRIST, CAMERAS, HAND, 7)
 
 
 @pytest.mark.parametrize("name", TWO_RIG_SCENES)
 def test_they_are_legal_smooth_and_closed_and_the_wrist_bends(name: str) -> None:
-    found = states(motion_of(name))
+    found = states(name)
     angles, wrist_angles = (
         np.array([s.angles_rad for s in found]),
         np.array([s.wrist_angles_rad for s in found]),
@@ -69,8 +79,7 @@ def test_they_are_legal_smooth_and_closed_and_the_wrist_bends(name: str) -> None
 
 @pytest.mark.parametrize("name", TWO_RIG_SCENES)
 def test_both_kinds_of_rig_see_one_motion_of_a_seed(name: str) -> None:
-    desk = scene_by_name(name, DESK, CAMERAS, HAND, 7)
-    wrist = wrist_scene(name, 7)
+    desk, wrist = desk_scene(name), wrist_scene(name)
     apart = desk.truth(0.0).T_rig_palm[:3, 3] - wrist.motion.at(0.0).T_rig_palm[:3, 3]
     for t in (0.4, 2.9, 5.7, 8.3):
         marked, device = desk.truth(t), wrist.motion.at(t)
@@ -87,7 +96,7 @@ def test_both_kinds_of_rig_see_one_motion_of_a_seed(name: str) -> None:
 
 @pytest.mark.parametrize("name", TWO_RIG_SCENES)
 def test_the_hand_stays_in_the_picture(name: str) -> None:
-    scene = scene_by_name(name, DESK, CAMERAS, HAND, 7)
+    scene = desk_scene(name)
     for t in np.arange(0.0, scene.period_s, scene.period_s / 150):
         truth = scene.truth(float(t))
         assert 0.36 < truth.markers_m[:, 2].min()
@@ -97,10 +106,10 @@ def test_the_hand_stays_in_the_picture(name: str) -> None:
 
 
 def test_travel_reaches_one_metre_per_second_and_moves_show_every_turn() -> None:
-    travelled = np.array([s.T_rig_palm[:3, 3] for s in states(motion_of("both-travel"))])
+    travelled = np.array([s.T_rig_palm[:3, 3] for s in states("both-travel")])
     speed = np.linalg.norm(np.diff(travelled, axis=0), axis=1) * RATE_HZ
     assert 0.9 < speed.max() < 1.05
-    moved = states(motion_of("both-moves"))
+    moved = states("both-moves")
     angles = np.degrees([s.angles_rad for s in moved])
     assert (np.ptp(angles[:, 1:, 2], axis=0) > 45.0).all()
     rotated = np.array([s.T_rig_palm[:3, :3] for s in moved])
@@ -115,7 +124,7 @@ def test_an_unknown_name_is_none_of_them() -> None:
 
 def test_what_the_imu_of_a_wrist_device_says_is_the_forearms_turn() -> None:
     """Its filter's vertical, after ten seconds of bending, is that of the forearm; the palm's is elsewhere."""
-    scene = wrist_scene("both-moves", 7)
+    scene = wrist_scene("both-moves")
     imu = scene.rig.imu
     assert imu is not None
     assert imu.q_palm_imu is not None
