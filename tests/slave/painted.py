@@ -12,6 +12,7 @@ import numpy as np
 
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, HsvRange
+from tests.slave.stand_ins import camera_file
 
 NAMES = ("thumb", "index", "middle", "ring", "little", "back")
 HUE = (89, 66, 111, 141, 167, 38)
@@ -40,13 +41,10 @@ def marker_hsv(marker: int) -> tuple[int, int, int]:
 def camera(
     width: int = 640, height: int = 480, ranges: dict[str, HsvRange] | None = None
 ) -> CameraCalibration:
-    return CameraCalibration(
-        version=1,
-        name="left",
+    return camera_file(
         width_px=width,
         height_px=height,
         frame_rate_hz=60.0,
-        exposure_us=5000.0,
         analogue_gain=1.0,
         colour_gains=(1.0, 1.0),
         row_time_us=0.0,

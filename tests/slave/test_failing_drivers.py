@@ -26,18 +26,9 @@ from slave.sender import MarkerPipeline, WristPipeline, run
 from slave.sources import LOG_EVERY_NS, Failures, Frame, FrameSource
 from tests.slave.fake_picamera2 import OV7251, Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice
+from tests.slave.stand_ins import camera_file
 
-FILE = CameraCalibration(
-    version=1,
-    name="left",
-    width_px=640,
-    height_px=480,
-    frame_rate_hz=30.0,
-    exposure_us=5000.0,
-    analogue_gain=1.25,
-    colour_gains=(0.83, 1.24),
-    row_time_us=33.6,
-)
+FILE = camera_file()
 MONO = replace(FILE, colour_gains=(1.0, 1.0))
 CODES = {"gain": 32, "white_balance_temperature": 4600}
 GREY = {"GREY": {(640, 480): (30.0,)}}

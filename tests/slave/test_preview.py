@@ -12,7 +12,15 @@ from hypothesis import strategies as st
 
 from common.arrays import Image
 from common.errors import BusError
-from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Command, Message, Preview, Still
+from common.messages import (
+    MAX_PREVIEW_BYTES,
+    MAX_STILL_BYTES,
+    Command,
+    MarkerDetections,
+    Message,
+    Preview,
+    Still,
+)
 from slave import preview
 from slave.markers.detector import MarkerDetector
 from slave.preview import PERIOD_NS, POLL_NS, Gate, Previews, small_jpeg, whole_jpeg
@@ -23,7 +31,7 @@ from slave.uplink import Uplink
 from tests.memory_bus import LoopbackBus
 from tests.network_helpers import ManualClock, until
 from tests.slave.painted import NAMES, camera, hand, render
-from tests.slave.test_sender import Source, Wire
+from tests.slave.stand_ins import Listed, Wire
 
 STEP_NS = 16_666_667
 IMAGE = np.full((480, 640, 3), 80, np.uint8)
@@ -81,7 +89,7 @@ def test_when_nobody_looks_nothing_is_encoded(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_a_request_over_the_bus_shows_the_newest_frames_until_it_expires() -> None:
-    bus, clock, wire = LoopbackBus(), ManualClock(10**9), Wire()
+    bus, clock, wire = LoopbackBus(), ManualClock(10**9), Wire(MarkerDetections)
     feed = bus.subscribe("preview", "left", depth=100)
     shown = Previews("left", clock)
     reporter = Reporter(
@@ -140,14 +148,14 @@ def test_a_slow_bus_never_holds_the_loop_and_the_newest_frame_comes_next() -> No
     feed = bus.subscribe("preview")
     shown = Previews("left", clock)
     picture = render(hand())
-    wire, counters = Wire(), DetectionCounters(NAMES)
+    wire, counters = Wire(MarkerDetections), DetectionCounters(NAMES)
     try:
         shown.use(bus)
         shown.ask()
         shown.offer(Frame(0, 0, 0, IMAGE))
         assert bus.entered.wait(60.0)
         # The loop runs to its end while the bus holds the first picture.
-        source = Source([Frame(i, i * 5 * STEP_NS, i * 5 * STEP_NS, picture) for i in range(1, 13)])
+        source = Listed([Frame(i, i * 5 * STEP_NS, i * 5 * STEP_NS, picture) for i in range(1, 13)])
         run(
             source,
             MarkerPipeline(

@@ -15,7 +15,7 @@ import pytest
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.clock import SystemClock
 from common.errors import BusError, CalibrationError
-from common.messages import Command, Health
+from common.messages import Command, Health, MarkerDetections
 from common.messages.command_bodies import RawRequest, raw_name
 from common.recording.frame_recording import open_recording
 from slave import raw
@@ -32,8 +32,8 @@ from slave.uplink import Uplink
 from tests.common.recording.test_frame_writing import check_whole
 from tests.memory_bus import LoopbackBus
 from tests.network_helpers import until
+from tests.slave.stand_ins import Wire
 from tests.slave.test_recorder import ListCamera
-from tests.slave.test_tuning import Wire
 
 PLENTY = 10**12
 PERIOD_NS = 16_666_667
@@ -55,7 +55,7 @@ class Slave:
         self.counters = DetectionCounters(rig.markers)
         self.reporter = Reporter(
             name,
-            cast(Uplink, Wire()),
+            cast(Uplink, Wire(MarkerDetections, "tcp/127.0.0.1:1")),
             self.counters,
             SystemClock(),
             lambda _: bus.join(),
@@ -71,7 +71,11 @@ class Slave:
         run(
             source,
             MarkerPipeline(
-                self.name, 77, Wire().send, lambda _image, _t_ns: Detections.none(6), self.counters
+                self.name,
+                77,
+                Wire(MarkerDetections, "tcp/127.0.0.1:1").send,
+                lambda _image, _t_ns: Detections.none(6),
+                self.counters,
             ),
             threading.Event(),
         )

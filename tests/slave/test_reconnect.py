@@ -9,25 +9,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from common.calibration import CameraCalibration
 from common.clock import Clock
 from common.errors import CameraError, ImuError, PhalanxError, TrackerChoiceError, TrackerError
 from common.messages import ImuSample, TrackerPose
 from slave import sources
 from slave.reconnect import ReconnectingCamera, ReconnectingDriver, ReconnectingTracker
 from slave.sources import LOG_EVERY_NS, Frame, Reporting
+from tests.slave.stand_ins import camera_file
 
-CALIBRATION = CameraCalibration(
-    version=1,
-    name="left",
-    width_px=16,
-    height_px=16,
-    frame_rate_hz=50.0,
-    exposure_us=5000.0,
-    analogue_gain=1.25,
-    colour_gains=(0.83, 1.24),
-    row_time_us=30.0,
-)
+CALIBRATION = camera_file(width_px=16, height_px=16, frame_rate_hz=50.0, row_time_us=30.0)
 PERIOD_NS = 20_000_000
 DEVICES = ("camera", "IMU", "tracker")
 Item = Frame | ImuSample | TrackerPose

@@ -8,7 +8,7 @@ from typing import cast
 from common.bus.keys import Access
 from common.calibration.camera_settings import WANTED, figures
 from common.clock import SystemClock
-from common.messages import Command, Health, decode, encode
+from common.messages import Command, Health, MarkerDetections, decode, encode
 from master.checklist.slave_rules import AMBIGUOUS, COLOUR, OFF, OVERLAP, SEEN, UNCOLOURED
 from slave import live
 from slave.markers.engine import NUMPY
@@ -19,7 +19,8 @@ from slave.tuning import CameraTuning
 from slave.uplink import Uplink
 from tests.memory_bus import LoopbackBus
 from tests.network_helpers import until
-from tests.slave.test_tuning import FILE, RIG, Knobs, Wire, tree
+from tests.slave.stand_ins import Wire
+from tests.slave.test_tuning import FILE, RIG, Knobs, tree
 
 METRICS = {
     *(WANTED + setting for setting in OFF),
@@ -37,15 +38,9 @@ class Camera(Knobs):
         return figures((self.tuned or [FILE])[-1])
 
 
-class Alone(Wire):
-    """An uplink that has found no master."""
-
-    zenoh_endpoint = None
-
-
 def test_a_slave_reports_what_the_checklist_judges(tmp_path: Path) -> None:
     files, clock, stop = tree(tmp_path), SystemClock(), threading.Event()
-    uplink = cast(Uplink, Alone())
+    uplink = cast(Uplink, Wire(MarkerDetections))
     sender = Sender("left", uplink, clock, stop, lambda _line: None, Service({}), cast(Access, None))
     with ThreadPoolExecutor(1) as workers:
         line = live._marker_line(sender, files, "follow", "full", NUMPY, workers)

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from common.clock import SystemClock
 from common.errors import BusError, CameraError
-from common.messages import Command, Health, MarkerDetections, Message
+from common.messages import Command, Health, MarkerDetections
 from slave.markers.detector import MarkerDetector
 from slave.report import ALONE_AT, DetectionCounters, Reporter
 from slave.sender import MarkerPipeline, run, wait_for_start
@@ -15,46 +15,10 @@ from slave.sources import Frame
 from slave.uplink import Uplink
 from tests.memory_bus import LoopbackBus
 from tests.slave.painted import CENTRES, NAMES, camera, hand, render
+from tests.slave.stand_ins import Listed, Wire
 
 DETECTOR = MarkerDetector(camera(), NAMES)
 HAND, EMPTY = render(hand()), render([])
-
-
-class Source:
-    """A camera with a list of frames; an exception in the list is raised."""
-
-    def __init__(self, frames: list[Frame | CameraError]) -> None:
-        self.frames = frames
-
-    def read(self) -> Frame | None:
-        if not self.frames:
-            return None
-        frame = self.frames.pop(0)
-        if isinstance(frame, CameraError):
-            raise frame
-        return frame
-
-    def close(self) -> None:
-        self.frames = []
-
-
-class Wire:
-    """Stands for the uplink."""
-
-    session = 77
-    zenoh_endpoint: str | None = None
-    counts: dict[str, int] = {"sent": 3}
-
-    def __init__(self) -> None:
-        self.sent: list[MarkerDetections] = []
-        self.waits = [False, False, True]
-
-    def send(self, message: Message) -> None:
-        assert isinstance(message, MarkerDetections)
-        self.sent.append(message)
-
-    def wait_for_start(self, timeout_s: float) -> bool:
-        return self.waits.pop(0) if self.waits else False
 
 
 def frame(seq: int, image: np.ndarray) -> Frame:
@@ -62,8 +26,8 @@ def frame(seq: int, image: np.ndarray) -> Frame:
 
 
 def test_the_scatter_of_a_stamp_travels_with_it() -> None:
-    wire = Wire()
-    source = Source([replace(frame(3, HAND), t_sigma_ns=1.2e6), frame(4, HAND)])
+    wire = Wire(MarkerDetections)
+    source = Listed([replace(frame(3, HAND), t_sigma_ns=1.2e6), frame(4, HAND)])
     run(
         source,
         MarkerPipeline("left", wire.session, wire.send, DETECTOR.fresh().push, DetectionCounters(NAMES)),
@@ -73,8 +37,8 @@ def test_the_scatter_of_a_stamp_travels_with_it() -> None:
 
 
 def test_every_frame_is_sent_with_its_times_the_empty_ones_too() -> None:
-    wire, counters = Wire(), DetectionCounters(NAMES)
-    source = Source([frame(3, HAND), frame(4, EMPTY), frame(7, HAND)])
+    wire, counters = Wire(MarkerDetections), DetectionCounters(NAMES)
+    source = Listed([frame(3, HAND), frame(4, EMPTY), frame(7, HAND)])
     run(
         source,
         MarkerPipeline("left", wire.session, wire.send, DETECTOR.fresh().push, counters),
@@ -94,17 +58,17 @@ def test_every_frame_is_sent_with_its_times_the_empty_ones_too() -> None:
 
 
 def test_the_loop_ends_when_stopped_and_passes_a_lost_camera_on() -> None:
-    wire, stop = Wire(), threading.Event()
+    wire, stop = Wire(MarkerDetections), threading.Event()
     stop.set()
     run(
-        Source([frame(0, HAND)]),
+        Listed([frame(0, HAND)]),
         MarkerPipeline("left", wire.session, wire.send, DETECTOR.fresh().push, DetectionCounters(NAMES)),
         stop,
     )
     assert wire.sent == []
     with pytest.raises(CameraError, match="unplugged"):
         run(
-            Source([CameraError("unplugged")]),
+            Listed([CameraError("unplugged")]),
             MarkerPipeline("left", wire.session, wire.send, DETECTOR.fresh().push, DetectionCounters(NAMES)),
             threading.Event(),
         )
@@ -112,9 +76,9 @@ def test_the_loop_ends_when_stopped_and_passes_a_lost_camera_on() -> None:
 
 def test_the_barrier_opens_with_the_start_and_with_stop() -> None:
     stop = threading.Event()
-    assert wait_for_start(Wire().wait_for_start, stop)
+    assert wait_for_start(Wire(MarkerDetections, waits=2).wait_for_start, stop)
     stop.set()
-    assert not wait_for_start(Wire().wait_for_start, stop)
+    assert not wait_for_start(Wire(MarkerDetections, waits=2).wait_for_start, stop)
 
 
 def test_gauges_speak_of_the_time_since_the_last_look() -> None:
@@ -131,7 +95,12 @@ def test_gauges_speak_of_the_time_since_the_last_look() -> None:
 
 
 def test_health_is_published_and_commands_are_answered_once_the_bus_is_known() -> None:
-    hub, wire, counters, stop = LoopbackBus(), Wire(), DetectionCounters(NAMES), threading.Event()
+    hub, wire, counters, stop = (
+        LoopbackBus(),
+        Wire(MarkerDetections),
+        DetectionCounters(NAMES),
+        threading.Event(),
+    )
     counters.frame(0, 1_000_000, CENTRES)
     asked: list[str] = []
 
@@ -165,8 +134,7 @@ def test_health_is_published_and_commands_are_answered_once_the_bus_is_known() -
 
 
 def test_a_bus_that_cannot_be_opened_is_tried_again_and_never_ends_the_slave() -> None:
-    hub, wire = LoopbackBus(), Wire()
-    wire.zenoh_endpoint = "tcp/127.0.0.1:1"
+    hub, wire = LoopbackBus(), Wire(MarkerDetections, "tcp/127.0.0.1:1")
     tries: list[str] = []
 
     def connect(endpoint: str) -> LoopbackBus:
@@ -205,7 +173,7 @@ def test_a_bus_that_cannot_be_opened_is_tried_again_and_never_ends_the_slave() -
 def test_a_slave_without_a_master_says_what_it_hears(
     counts: dict[str, int], output: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    wire = Wire()
+    wire = Wire(MarkerDetections)
     wire.counts = counts
     looked = threading.Event()
     reporter = Reporter(

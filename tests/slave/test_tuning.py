@@ -14,7 +14,7 @@ import pytest
 from common.calibration import CameraCalibration, HandProfile, HsvRange, RigCalibration, load, save
 from common.clock import SystemClock
 from common.errors import BusError, CalibrationError, CameraError
-from common.messages import Command, Health, MarkerDetections, Message
+from common.messages import Command, Health, MarkerDetections
 from common.sim.motion import HandState
 from common.sim.render import Renderer
 from common.sim.scene import Scene
@@ -28,6 +28,7 @@ from slave.tuning import CameraFiles, CameraTuning
 from slave.uplink import Uplink
 from tests.memory_bus import LoopbackBus
 from tests.network_helpers import until
+from tests.slave.stand_ins import Wire
 
 pytestmark = pytest.mark.usefixtures("drawn_once")
 ROOT = Path(__file__).resolve().parents[2]
@@ -232,26 +233,11 @@ def test_files_are_not_looked_at_before_frames_come(files: CameraFiles, knobs: K
     assert knobs.tuned == [changed(exposure_us=7000.0)]
 
 
-class Wire:
-    """Stands for the uplink."""
-
-    session = 77
-    zenoh_endpoint: str | None = "tcp/127.0.0.1:1"
-    counts: dict[str, int] = {}
-
-    def __init__(self) -> None:
-        self.sent: list[MarkerDetections] = []
-
-    def send(self, message: Message) -> None:
-        assert isinstance(message, MarkerDetections)
-        self.sent.append(message)
-
-
 class Slave:
     """What `phalanx-slave run` joins, with a simulated camera, on a bus inside this process."""
 
     def __init__(self, files: CameraFiles, stop: threading.Event) -> None:
-        self.bus, self.wire, self.files = LoopbackBus(), Wire(), files
+        self.bus, self.wire, self.files = LoopbackBus(), Wire(MarkerDetections, "tcp/127.0.0.1:1"), files
         clock = SystemClock()
         self.source = SyntheticCamera(SCENE, "left", clock.now_ns(), clock, 0, clock)
 

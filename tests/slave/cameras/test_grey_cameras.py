@@ -1,6 +1,7 @@
 """Grey frames of real cameras: every depth and packing of a monochrome sensor, and luma of colour cameras by name."""
 
 import threading
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
+from common.messages import WristDetections
 from common.recording.frame_recording import Illumination, open_recording
 from slave.__main__ import main
 from slave.cameras import v4l2_abi as abi
@@ -25,26 +27,24 @@ from slave.sender import WristPipeline, run
 from slave.wrist.detector import WristDetector
 from tests.slave.fake_picamera2 import OV7251, OV9281, Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice, colour, level, row_bytes, webcam_knobs
-from tests.slave.wrist.test_loop import NAMES, Source, Wire
+from tests.slave.stand_ins import Listed, Wire, camera_file
+from tests.slave.wrist.test_loop import NAMES
 from tests.slave.wrist.wrist_frames import ROOT, VIEW, strobed
 
 SIZE = (640, 480)
 RATE_HZ = 90.0
 
 
-def calibration(**changes: Any) -> CameraCalibration:
-    values: dict[str, Any] = {
-        "version": 1,
-        "name": "wrist",
-        "width_px": SIZE[0],
-        "height_px": SIZE[1],
-        "frame_rate_hz": RATE_HZ,
-        "exposure_us": 2000.0,
-        "analogue_gain": 1.25,
-        "colour_gains": (1.0, 1.0),
-        "row_time_us": 0.0,
-    }
-    return CameraCalibration(**(values | changes))
+calibration = partial(
+    camera_file,
+    name="wrist",
+    width_px=SIZE[0],
+    height_px=SIZE[1],
+    frame_rate_hz=RATE_HZ,
+    exposure_us=2000.0,
+    colour_gains=(1.0, 1.0),
+    row_time_us=0.0,
+)
 
 
 def usb(camera: Camera, pixels: Pixels = Pixels.GREY, **changes: Any) -> V4l2Camera:
@@ -283,11 +283,11 @@ def strobed_camera() -> Camera:
 
 
 def test_a_hand_before_a_real_camera_is_found_as_in_the_same_pictures_of_8_bits() -> None:
-    source, wire = usb(strobed_camera()), Wire()
+    source, wire = usb(strobed_camera()), Wire(WristDetections)
     detector = WristDetector(VIEW, RATE_HZ)
     taken = (frame for _ in range(12) if (frame := source.read()) is not None)
     run(
-        Source(list(taken)),
+        Listed(taken),
         WristPipeline("wrist", wire.session, wire.send, detector.push, DetectionCounters(NAMES)),
         threading.Event(),
     )

@@ -7,12 +7,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 
-from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
 from slave.cameras.picamera2 import BUFFERS, Picamera2Camera
@@ -27,21 +27,9 @@ from tests.slave.fake_picamera2 import (
     install,
     parameters,
 )
+from tests.slave.stand_ins import camera_file
 
-
-def calibration(**changes: Any) -> CameraCalibration:
-    values: dict[str, Any] = {
-        "version": 1,
-        "name": "left",
-        "width_px": 640,
-        "height_px": 480,
-        "frame_rate_hz": 50.0,
-        "exposure_us": 5000.0,
-        "analogue_gain": 1.25,
-        "colour_gains": (0.83, 1.24),
-        "row_time_us": 33.6,
-    }
-    return CameraCalibration(**(values | changes))
+calibration = partial(camera_file, frame_rate_hz=50.0)
 
 
 def opened(

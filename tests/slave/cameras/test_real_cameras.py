@@ -18,18 +18,9 @@ from slave.reconnect import ReconnectingCamera
 from slave.sources import FrameSource
 from tests.slave.fake_picamera2 import Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice
+from tests.slave.stand_ins import camera_file
 
-CALIBRATION = CameraCalibration(
-    version=1,
-    name="left",
-    width_px=640,
-    height_px=480,
-    frame_rate_hz=30.0,
-    exposure_us=5000.0,
-    analogue_gain=1.25,
-    colour_gains=(0.83, 1.24),
-    row_time_us=33.6,
-)
+CALIBRATION = camera_file()
 
 
 def opened(driver: str, *arguments: str, wrist: bool = False) -> FrameSource | None:

@@ -4,6 +4,7 @@ import ctypes as c
 import errno
 import os
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,6 @@ import cv2
 import numpy as np
 import pytest
 
-from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
 from slave.cameras import v4l2_abi as abi
@@ -20,24 +20,13 @@ from slave.cameras.v4l2 import BUFFERS, V4l2Camera, V4l2Options
 from slave.cameras.v4l2_controls import plain_name, read_controls
 from slave.cameras.v4l2_formats import Layout, choose_offer, read_offers
 from tests.slave.fake_v4l2 import Camera, FakeDevice, Knob, colour, encode
+from tests.slave.stand_ins import camera_file
 
 GIVEN = {"gain": 32, "white_balance_temperature": 4600}
 PERIOD_NS = 1e9 / 30.0
 
 
-def calibration(**changes: Any) -> CameraCalibration:
-    values: dict[str, Any] = {
-        "version": 1,
-        "name": "left",
-        "width_px": 640,
-        "height_px": 480,
-        "frame_rate_hz": 30.0,
-        "exposure_us": 5000.0,
-        "analogue_gain": 1.25,
-        "colour_gains": (0.83, 1.24),
-        "row_time_us": 30.0,
-    }
-    return CameraCalibration(**(values | changes))
+calibration = partial(camera_file, row_time_us=30.0)
 
 
 def opened(camera: Camera, options: V4l2Options | None = None, **changes: Any) -> V4l2Camera:

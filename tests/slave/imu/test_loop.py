@@ -11,9 +11,8 @@ import pytest
 
 from common.calibration import ImuCalibration, RigCalibration, load, save
 from common.clock import SystemClock
-from common.errors import ImuError
 from common.imu.fusion import OrientationFilter
-from common.messages import Command, ImuSample, Message
+from common.messages import Command, ImuSample
 from slave.__main__ import main
 from slave.report import Reporter, imu_counters
 from slave.sender import ImuPipeline, run, skip_one, wait_for_start
@@ -21,6 +20,7 @@ from slave.sources import Reporting
 from slave.uplink import Uplink
 from tests.memory_bus import LoopbackBus
 from tests.network_helpers import until
+from tests.slave.stand_ins import Listed, Wire
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -30,42 +30,9 @@ def sample(seq: int) -> ImuSample:
     return ImuSample("imu", 0, seq, 8_333_333 * seq, nothing, nothing, nothing, np.full(4, np.nan))
 
 
-class Source:
-    """An IMU with a list of samples; an exception in the list is raised."""
-
-    def __init__(self, samples: list[ImuSample | ImuError]) -> None:
-        self.samples = samples
-
-    def read(self) -> ImuSample | None:
-        if not self.samples:
-            return None
-        one = self.samples.pop(0)
-        if isinstance(one, ImuError):
-            raise one
-        return one
-
-    def close(self) -> None:
-        self.samples = []
-
-
-class Wire:
-    """Stands for the uplink."""
-
-    session = 77
-    zenoh_endpoint: str | None = "there"
-    counts: dict[str, int] = {"sent": 3, "unsent": 1}
-
-    def __init__(self) -> None:
-        self.sent: list[ImuSample] = []
-
-    def send(self, message: Message) -> None:
-        assert isinstance(message, ImuSample)
-        self.sent.append(message)
-
-
 def test_every_sample_is_sent_in_the_name_of_this_process_and_gaps_are_counted() -> None:
-    wire, counters = Wire(), imu_counters(None)
-    source = Source([sample(k) for k in (40, 41, 45, 46)])
+    wire, counters = Wire(ImuSample, "there"), imu_counters(None)
+    source = Listed([sample(k) for k in (40, 41, 45, 46)])
     run(source, ImuPipeline(77, wire.send, counters), threading.Event())
     assert [(one.source, one.session, one.seq, one.t_ns) for one in wire.sent] == [
         ("imu", 77, seq, 8_333_333 * seq) for seq in (40, 41, 45, 46)
@@ -89,7 +56,7 @@ class Filter:
         return msgspec.structs.replace(sample, orientation_wxyz=np.array([1.0, 0.0, 0.0, 0.0]))
 
 
-class ReportingSource(Source, Reporting):
+class Imu(Listed[ImuSample], Reporting):
     """An IMU that has more to tell."""
 
     def counts(self) -> dict[str, int]:
@@ -100,7 +67,7 @@ class ReportingSource(Source, Reporting):
 
 
 def test_the_filters_orientation_is_sent_and_its_counts_and_those_of_the_imu_are_reported() -> None:
-    wire, source, orientation = Wire(), ReportingSource([sample(0), sample(1)]), Filter()
+    wire, source, orientation = Wire(ImuSample, "there"), Imu([sample(0), sample(1)]), Filter()
     counters = imu_counters(source, cast(OrientationFilter, orientation))
     run(source, ImuPipeline(77, wire.send, counters, orientation.push), threading.Event())
     assert [one.orientation_wxyz.tolist() for one in wire.sent] == [[1.0, 0.0, 0.0, 0.0]] * 2
@@ -126,7 +93,7 @@ def test_the_filters_orientation_is_sent_and_its_counts_and_those_of_the_imu_are
 
 
 def test_samples_before_the_start_are_read_and_only_the_filter_sees_them() -> None:
-    source, orientation, wire = Source([sample(k) for k in range(5)]), Filter(), Wire()
+    source, orientation, wire = Listed([sample(k) for k in range(5)]), Filter(), Wire(ImuSample, "there")
     pipeline = ImuPipeline(77, wire.send, imu_counters(source), orientation.push)
     waits = iter([False, False, False, True])
 
@@ -135,7 +102,7 @@ def test_samples_before_the_start_are_read_and_only_the_filter_sees_them() -> No
         return next(waits)
 
     assert wait_for_start(started, threading.Event(), skip=partial(skip_one, source, pipeline))
-    assert (len(source.samples), orientation.pushed, len(wire.sent)) == (2, 3, 0)
+    assert (len(source.items), orientation.pushed, len(wire.sent)) == (2, 3, 0)
     assert pipeline.counters.counts()["samples"] == 0
 
 
@@ -143,7 +110,7 @@ def test_a_sample_that_the_filter_fails_of_is_left_out_before_the_start_and_afte
     def fail(_sample: ImuSample) -> ImuSample:
         raise IndexError("a fault in the filter")
 
-    source, wire = Source([sample(k) for k in range(5)]), Wire()
+    source, wire = Listed([sample(k) for k in range(5)]), Wire(ImuSample, "there")
     pipeline = ImuPipeline(77, wire.send, imu_counters(source), fail)
     assert skip_one(source, pipeline)
     run(source, pipeline, threading.Event())
@@ -155,12 +122,18 @@ def test_it_reports_and_stops_on_the_bus() -> None:
     for seq in (1, 2, 4):
         counters.item(seq)
     reporter = Reporter(
-        "imu", cast(Uplink, Wire()), counters, SystemClock(), lambda _endpoint: bus, stop.set, 0.01
+        "imu",
+        cast(Uplink, Wire(ImuSample, "there")),
+        counters,
+        SystemClock(),
+        lambda _endpoint: bus,
+        stop.set,
+        0.01,
     )
     assert until(lambda: "imu" in bus.alive())
     health = bus.ask(Command("imu", "report", ""), 5.0)
     assert (health.source, health.session) == ("imu", 77)
-    assert health.counts == {"samples": 3, "skipped": 1, "failed": 0, "sent": 3, "unsent": 1}
+    assert health.counts == {"samples": 3, "skipped": 1, "failed": 0, "sent": 3}
     with pytest.raises(Exception, match="no command 'preview'; there are report, stop"):
         bus.ask(Command("imu", "preview", ""), 5.0)
     bus.ask(Command("imu", "stop", ""), 5.0)

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from common.errors import CameraError
+from common.messages import MarkerDetections
 from slave.__main__ import main
 from slave.cli.table import PROGRAM
 from slave.markers.detector import MarkerDetector
@@ -16,9 +16,9 @@ from slave.markers.reloadable import CalibratedDetector, ReloadableDetector
 from slave.markers.scan import JUDGED, PROBE_EVERY, PROBES, Scan, ScanChoice
 from slave.report import DetectionCounters
 from slave.sender import MarkerPipeline, run
-from slave.sources import Frame
 from tests.slave.painted import NAMES, RANGES, camera, hand, render
-from tests.slave.test_sender import Source, Wire, frame
+from tests.slave.stand_ins import Listed, Wire
+from tests.slave.test_sender import frame
 
 STEP_NS = 16_666_667
 PERIOD_MS = 1000.0 / 60.0  # of the camera of `painted`
@@ -120,10 +120,10 @@ def test_the_running_slave_measures_and_chooses_and_counts() -> None:
     counters = DetectionCounters(
         NAMES, lambda: {"windows": 0 if detector.choice is None else detector.choice.frames}
     )
-    wire, count = Wire(), JUDGED + 20
-    frames: list[Frame | CameraError] = [frame(k, HAND) for k in range(count)]
+    wire, count = Wire(MarkerDetections), JUDGED + 20
+    frames = [frame(k, HAND) for k in range(count)]
     run(
-        Source(frames),
+        Listed(frames),
         MarkerPipeline("left", wire.session, wire.send, detector.push, counters),
         threading.Event(),
     )
@@ -134,7 +134,7 @@ def test_the_running_slave_measures_and_chooses_and_counts() -> None:
         np.testing.assert_array_equal(message.uv, wire.sent[0].uv)
     detector, plain = reloadable("auto", whole_ms=2.0)
     run(
-        Source([frame(k, HAND) for k in range(count)]),
+        Listed([frame(k, HAND) for k in range(count)]),
         MarkerPipeline("left", wire.session, wire.send, detector.push, counters),
         threading.Event(),
     )

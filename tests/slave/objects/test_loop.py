@@ -11,15 +11,16 @@ from msgspec.structs import replace
 from common.calibration import RigCalibration, load, save
 from common.calibration.object_profile import ObjectProfile
 from common.clock import SkewedClock, SystemClock
-from common.errors import CalibrationError, TrackerError
+from common.errors import CalibrationError
 from common.geometry.transforms import matrix_to_rotation_vector, quaternion_to_matrix
-from common.messages import Message, TrackerPose
+from common.messages import TrackerPose
 from common.sim.sensors import SET_UP_TRACKER, SET_UP_TRACKING, SimulatedTracker
 from slave.__main__ import main
 from slave.commands.simulated import TRACKER_HZ, SyntheticSensor, poses_of, tracker_of
 from slave.report import pose_counters
 from slave.sender import PosePipeline, run, skip_one, wait_for_start
 from slave.sources import Reporting
+from tests.slave.stand_ins import Listed, Wire
 
 CALIB = Path(__file__).resolve().parents[3] / "calib_json"
 KEY = "11" * 32
@@ -32,22 +33,8 @@ def pose(seq: int, known: bool = True) -> TrackerPose:
     return TrackerPose("tracker", 0, seq, 10_000_000 * seq, place, quaternion)
 
 
-class Source(Reporting):
-    """A tracker with a list of poses; an exception in the list is raised."""
-
-    def __init__(self, poses: list[TrackerPose | TrackerError]) -> None:
-        self.poses = poses
-
-    def read(self) -> TrackerPose | None:
-        if not self.poses:
-            return None
-        one = self.poses.pop(0)
-        if isinstance(one, TrackerError):
-            raise one
-        return one
-
-    def close(self) -> None:
-        self.poses = []
+class Tracker(Listed[TrackerPose], Reporting):
+    """A tracker that has more to tell."""
 
     def counts(self) -> dict[str, int]:
         return {"lost": 2}
@@ -56,27 +43,9 @@ class Source(Reporting):
         return {"away_s": 0.5}
 
 
-class Wire:
-    """Stands for the uplink."""
-
-    session = 77
-
-    def __init__(self, waits: int = 0) -> None:
-        self.sent: list[TrackerPose] = []
-        self.waits = waits
-
-    def wait_for_start(self, timeout_s: float) -> bool:
-        self.waits -= 1
-        return self.waits < 0
-
-    def send(self, message: Message) -> None:
-        assert isinstance(message, TrackerPose)
-        self.sent.append(message)
-
-
 def test_every_pose_is_sent_in_the_name_of_this_process_and_counted() -> None:
-    source = Source([pose(0), pose(1, known=False), pose(4)])
-    wire, counters = Wire(), pose_counters(source)
+    source = Tracker([pose(0), pose(1, known=False), pose(4)])
+    wire, counters = Wire(TrackerPose), pose_counters(source)
     run(source, PosePipeline(77, wire.send, counters), threading.Event())
     assert [(one.session, one.seq) for one in wire.sent] == [(77, 0), (77, 1), (77, 4)]
     assert counters.counts() == {"poses": 3, "skipped": 2, "failed": 0, "nowhere": 1, "lost": 2}
@@ -88,12 +57,12 @@ def test_every_pose_is_sent_in_the_name_of_this_process_and_counted() -> None:
 
 @pytest.mark.parametrize("recorded", [False, True])
 def test_poses_before_the_start_are_forgotten_but_of_a_recording_nothing_is_missed(recorded: bool) -> None:
-    source, wire = Source([pose(k) for k in range(9)]), Wire(waits=3)
+    source, wire = Tracker([pose(k) for k in range(9)]), Wire(TrackerPose, waits=3)
     pipeline = PosePipeline(77, wire.send, pose_counters(source))
     skip = None if recorded else partial(skip_one, source, pipeline)
     assert wait_for_start(wire.wait_for_start, threading.Event(), skip=skip)
-    assert len(source.poses) == (9 if recorded else 6)
-    source.poses = []
+    assert len(source.items) == (9 if recorded else 6)
+    source.items = []
     wire.waits = 3
     ended = wait_for_start(wire.wait_for_start, threading.Event(), skip=skip)
     assert ended == recorded, "a source that has ended is waited for no longer"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from common.hand.model import FINGERS
-from common.messages import Message, WristDetections
+from common.messages import WristDetections
 from slave.__main__ import main
 from slave.report import DetectionCounters
 from slave.sender import DARK_AFTER, WristPipeline, run
@@ -16,36 +16,11 @@ from slave.wrist.detector import WristDetector, WristFound
 from slave.wrist.fingertips import Fingertips
 from slave.wrist.laser import LaserLines
 from slave.wrist.strobe import StrobeCycle
+from tests.slave.stand_ins import Listed, Wire
 from tests.slave.wrist.wrist_frames import CAMERA, ROOT, VIEW, strobed
 
 NAMES = tuple(f"{what}.{finger}" for what in ("laser", "tip") for finger in FINGERS)
 GREY = np.zeros((4, 4), np.uint8)
-
-
-class Source:
-    """A camera with a list of frames."""
-
-    def __init__(self, frames: list[Frame] | tuple[Frame, ...]) -> None:
-        self.frames = list(frames)
-
-    def read(self) -> Frame | None:
-        return self.frames.pop(0) if self.frames else None
-
-    def close(self) -> None:
-        self.frames = []
-
-
-class Wire:
-    """Stands for the uplink."""
-
-    session = 77
-
-    def __init__(self) -> None:
-        self.sent: list[WristDetections] = []
-
-    def send(self, message: Message) -> None:
-        assert isinstance(message, WristDetections)
-        self.sent.append(message)
 
 
 class ByNumber:
@@ -71,8 +46,12 @@ def frames(numbers: list[int]) -> list[Frame]:
 
 
 def test_every_cycle_is_sent_the_empty_ones_too_and_all_frames_are_counted() -> None:
-    wire, counters, shown = Wire(), DetectionCounters(NAMES, lambda: {"strobe.cycles": 3}), list[int]()
-    source = Source(frames([0, 1, 2, 3, 4, 5, 9, 10, 11]))
+    wire, counters, shown = (
+        Wire(WristDetections),
+        DetectionCounters(NAMES, lambda: {"strobe.cycles": 3}),
+        list[int](),
+    )
+    source = Listed(frames([0, 1, 2, 3, 4, 5, 9, 10, 11]))
     run(
         source,
         WristPipeline(
@@ -94,9 +73,9 @@ def test_every_cycle_is_sent_the_empty_ones_too_and_all_frames_are_counted() -> 
 
 
 def test_while_there_are_no_cycles_every_frame_is_shown_and_nothing_is_sent() -> None:
-    wire, counters, shown = Wire(), DetectionCounters(()), list[int]()
+    wire, counters, shown = Wire(WristDetections), DetectionCounters(()), list[int]()
     run(
-        Source(frames(list(range(30)))),
+        Listed(frames(list(range(30)))),
         WristPipeline(
             "wrist",
             wire.session,
@@ -119,17 +98,21 @@ def test_the_time_of_a_cycle_is_that_of_its_three_frames_however_long_there_was_
     monkeypatch.setattr("slave.sender.time.perf_counter_ns", lambda: next(ticks))
     counters = DetectionCounters(NAMES)
     # 300 frames of which none is the last of a triple: nobody before the device.
-    source = Source(frames([*(3 * k for k in range(300)), 900, 901, 902]))
-    run(source, WristPipeline("wrist", 77, Wire().send, ByNumber().push, counters), threading.Event())
+    source = Listed(frames([*(3 * k for k in range(300)), 900, 901, 902]))
+    run(
+        source,
+        WristPipeline("wrist", 77, Wire(WristDetections).send, ByNumber().push, counters),
+        threading.Event(),
+    )
     metrics = counters.metrics()
     assert (metrics["detect_us"], metrics["detect_worst_us"]) == (3000.0, 3000.0)
 
 
 def test_real_frames_go_through_the_loop_into_messages() -> None:
-    wire, counters = Wire(), DetectionCounters(NAMES)
+    wire, counters = Wire(WristDetections), DetectionCounters(NAMES)
     detector = WristDetector(VIEW, CAMERA.frame_rate_hz)
     run(
-        Source(strobed("curl", 6)),
+        Listed(strobed("curl", 6)),
         WristPipeline("wrist", wire.session, wire.send, detector.push, counters),
         threading.Event(),
     )
