@@ -11,7 +11,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from common.sim.two_rigs import TWO_RIG_SCENES
 
 from common.arrays import Float, Image, Int
 from common.errors import PhalanxError
@@ -20,6 +19,7 @@ from common.recording.frame_recording import Illumination
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from common.sim.scenes import scene_by_name
+from common.sim.two_rigs import TWO_RIG_SCENES
 from common.sim.wrist.motion import OnForearm
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene

@@ -86,7 +86,19 @@ def measure_windows(
         return
     for k in range(len(asked)):
         _measure_window(
-            image, table, places, cells, skin, curve, asked[k], rules, answers[k], windows, scratch, levels, ramp
+            image,
+            table,
+            places,
+            cells,
+            skin,
+            curve,
+            asked[k],
+            rules,
+            answers[k],
+            windows,
+            scratch,
+            levels,
+            ramp,
         )
 
 

@@ -56,7 +56,7 @@ class Outcome:
         swaps: Reports of a marker on the place of another one.
         swaps_unwarned: Swaps before the first warning.
         missed_unwarned: ImageObservations missed before the first warning.
-        gain_difference: Largest error of the estimated light in log gains of red or blue against green, after the first second.
+        light_error: Largest error of the estimated light in log gains against green, after a second.
     """
 
     visible: int = 0
@@ -64,7 +64,7 @@ class Outcome:
     swaps: int = 0
     swaps_unwarned: int = 0
     missed_unwarned: int = 0
-    gain_difference: float = 0.0
+    light_error: float = 0.0
 
 
 @cache
@@ -102,7 +102,9 @@ def outcome(
         if following is not None:
             warned = warned or bool(following.warnings)
             if k >= rate_hz:
-                got.gain_difference = max(got.gain_difference, gain_difference(following.log_gains, np.log(gains_bgr), dim=0.0))
+                got.light_error = max(
+                    got.light_error, gain_difference(following.log_gains, np.log(gains_bgr), dim=0.0)
+                )
         if not warned:
             got.swaps_unwarned += swaps
             got.missed_unwarned += int((visible & ~seen).sum())

@@ -49,7 +49,7 @@ def test_markers_stay_found_and_themselves(schedule: LightSchedule, seed: int, c
     assert got.visible > 500
     assert got.swaps == 0
     assert got.found >= 0.99 * outcome(STILL, seed, camera).found
-    assert got.apart < 0.06
+    assert got.light_error < 0.06
 
 
 def test_without_following_the_same_light_swaps_markers() -> None:
