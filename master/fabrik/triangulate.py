@@ -247,7 +247,10 @@ def _cap_spread(
     points: Float,
     cov: Float,
 ) -> None:
-    """Write point and covariance of marker m by radius and direction (3,) of its finger, with `tilt` (3, 3)."""
+    """Write point and covariance of marker m by its finger's radius and direction.
+
+    `ahead` (3,) is the direction, `tilt` (3, 3) [rad^2] its covariance.
+    """
     point, off, aim, by, bias = work.point, work.off, work.aim, work.by, work.bias
     for k in range(3):
         by[k, 0] = CAPS.radius_share * (point[k] - aim[k])
@@ -284,7 +287,7 @@ def _add_noise(
     cov: Float,
     noise: Float,
 ) -> None:
-    """Add what centroids and law are wrong by: variances of the centroids [px^2], by the derivatives of the point."""
+    """Add the errors of centroids [px^2] and law, by the derivatives of the point."""
     ray, by = work.ray, work.by
     per_px, scale = metres_per_pixel(tables, z), z / tables.focal_px[0]
     for k in range(3):  # derivatives by u of the left camera, v of it, and u of the right one

@@ -1,4 +1,4 @@
-"""The quantities of a hand by which poses are distinguished, and how well a hand fits each pose.
+"""Quantities of a hand distinguish poses; each says how well a hand fits it.
 
 The quantities (`common.calibration.gesture_settings.Quantity`) distinguish poses. A tip that is off by s turns the
 finger's last two bones about the PIP, so that a bend is off by s over their length; that is the lever of all bends

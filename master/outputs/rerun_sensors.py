@@ -1,4 +1,4 @@
-"""Log what sensors see to a Rerun recording: a wrist device with its light, and images of cameras."""
+"""Log a wrist device with its light, and images of cameras, to Rerun."""
 
 from collections.abc import Mapping, Sequence
 

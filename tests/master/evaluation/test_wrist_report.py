@@ -120,7 +120,7 @@ def test_a_hand_before_both_kinds_of_rig_is_played_by_one_motion(root: Path) -> 
         Played.of(both, "standard", 5)
     (desk,), (wrist,) = (load_setups(root / "calib_json", (name,)) for name in ("desk", "wrist"))
     assert Played.of(desk, "grasp", 5).wrist_scene is Played.of(wrist, "curl@sun", 5).shown is None
-    assert [Played.of(desk, name, 5).together for name in ("grasp", "poses")] == [True, False]
+    assert [Played.of(desk, name, 5).two_rigs for name in ("grasp", "poses")] == [True, False]
 
 
 def test_laser_points_count_once_for_each_cycle(setup: RigSetup, scene: WristScene) -> None:

@@ -61,7 +61,7 @@ def test_derivatives_are_those_of_the_prediction() -> None:
     truth = scene(1, cameras=2, views=2)
     observations, bundle = _problem(truth, 0.0, 1)
     seen = observations[3]
-    by_lens, by_camera, by_view, by_shape = (by[0] for by in _jacobian(*_stacked([seen], 54), bundle)[1:])
+    by_lens, by_camera, by_view, by_shape = (by[0] for by in _jacobian(_stacked([seen], 54)[0], bundle)[1:])
     corners = len(bundle.drawn_m)
     cases: list[tuple[int, Float, float]] = [
         *((9 + i, by_lens[:, :, i], 1e-4 if i < 4 else 1e-6) for i in range(9)),
