@@ -26,8 +26,7 @@ from common.sim.wrist.board import WristBoardRenderer, WristBoardScene, board_po
 from common.sim.wrist.scene import WristScene
 from master.calibrate.cameras.boards import Checkerboard
 from master.calibrate.wrist.device import LitView
-from master.calibrate.wrist.laser_command import lines_of
-from master.calibrate.wrist.plane import PlaneFit, fit_plane
+from master.calibrate.wrist.laser_plane import PlaneFit, fit_plane, lines_of
 from master.calibrate.wrist.subject import Subject, calibrate_subject
 from master.estimator.wrist_pipeline import WristPipeline
 from master.rig.wrist import WristSetup

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from master.calibrate.extrinsics.extrinsics import Extrinsics
     from master.calibrate.wrist.curl import FingerCurl
     from master.calibrate.wrist.flat_field import FlatFit, WhiteSamples
-    from master.calibrate.wrist.plane import PlaneFit, ViewLine
+    from master.calibrate.wrist.laser_plane import PlaneFit, ViewLine
     from master.calibrate.wrist.subject import Subject
 
 

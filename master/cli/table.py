@@ -62,7 +62,7 @@ TABLE: tuple[Command | Family, ...] = (
             "master.cli.calibrate:hand", "master.calibrate.hand.commands:hand_command"),
     Family("calibrate wrist", "hand", "a wrist device: laser, light, how it sits, who wears it"),
     Command("calibrate wrist laser-plane", _WRIST, "the plane of the laser",
-            "master.cli.calibrate_devices:laser_plane", "master.calibrate.wrist.laser_command:laser_plane"),
+            "master.cli.calibrate_devices:laser_plane", "master.calibrate.wrist.laser_plane:laser_plane"),
     Command("calibrate wrist flat-field", _WRIST, "how the LEDs and the lens light the image",
             "master.cli.calibrate_devices:flat_field", "master.calibrate.wrist.flat_field:flat_field"),
     Command("calibrate wrist curl", _WRIST, "along which line the laser point of each finger moves",

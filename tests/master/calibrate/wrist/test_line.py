@@ -8,7 +8,7 @@ from common.arrays import Image
 from common.errors import FitError
 from common.recording.frame_recording import Illumination
 from master.calibrate.wrist.device import BoardPose, board_pose
-from master.calibrate.wrist.plane import line_on_board
+from master.calibrate.wrist.laser_line import line_on_board
 from tests.master.calibrate.wrist.devices import BOARD, OPTICS, cycles_of, plane_of, scene_of, view_of
 
 SEED, VIEWS = 11, 1

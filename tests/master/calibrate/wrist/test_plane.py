@@ -7,8 +7,7 @@ from common.arrays import Float
 from common.errors import FitError
 from common.geometry.transforms import rigid, rotation_vector_to_matrix
 from master.calibrate.wrist.device import BoardPose
-from master.calibrate.wrist.laser_command import lines_of
-from master.calibrate.wrist.plane import ViewLine, fit_plane
+from master.calibrate.wrist.laser_plane import ViewLine, fit_plane, lines_of
 from tests.master.calibrate.wrist.devices import (
     BOARD,
     FOCAL_PX,
