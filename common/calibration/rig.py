@@ -40,6 +40,9 @@ Place = tuple[Reach, Reach, Reach]
 Coefficient = Annotated[float, Meta(ge=-1e6, le=1e6)]
 
 
+LASER_ACROSS = 0.2  # by which a direction may leave the laser's plane: 12 degrees, far more than a line is bent
+
+
 class LaserPlane(Part, frozen=True):
     """Plane normal . X = offset in the wrist camera's frame."""
 
@@ -104,8 +107,7 @@ def check_wrist(
         if way is None or plane is None or not key.startswith("laser."):
             continue
         leaves = abs(sum(a * b for a, b in zip(plane.normal, way, strict=True)))
-        across = 0.2  # 12 degrees, far more than a line laser is bent
-        if leaves > across:
+        if leaves > LASER_ACROSS:
             raise CalibrationError(f"{where}: {key}: leaves laser_plane by {leaves:.2f} of its length")
     for finger, line in lines.items():
         if finger not in get_args(Finger):

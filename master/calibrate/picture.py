@@ -76,6 +76,22 @@ def draw_plane(path: Path, fit: "PlaneFit", lines: "Sequence[ViewLine]", optics:
     save_figure(figure, path)
 
 
+def draw_cloud(path: Path, fit: "PlaneFit", points_m: Float, used: Bool) -> None:
+    """Draw a cloud (N, 3) [m] from above, and its distances from the plane."""
+    figure = figure_of((11.0, 4.6))
+    figure.suptitle(
+        f"laser plane: normal ± {np.degrees(fit.normal_sigma_rad):.3f} deg, rms {1e3 * fit.rms_m:.3f} mm"
+    )
+    above, side = figure.subplots(1, 2)
+    off = points_m @ np.array(fit.plane.normal) - fit.plane.offset_m
+    for own, colour in ((used, BLUE), (~used, ORANGE)):
+        above.plot(*(1e3 * points_m[own][:, [0, 2]]).T, ".", markersize=2, color=colour)
+        side.plot(np.flatnonzero(own), 1e3 * off[own], ".", markersize=2, color=colour)
+    above.set(title="points from above [mm]", xlabel="x", ylabel="z", aspect="equal")
+    side.set(title="points off the plane [mm]; orange: left out", xlabel="point of the file")
+    save_figure(figure, path)
+
+
 def draw_flat_field(path: Path, fit: "FlatFit", samples: "WhiteSamples", optics: CameraModel) -> None:
     """Draw the flat field over the image, and its residuals where paper was seen."""
     figure = figure_of((15.0, 4.2))

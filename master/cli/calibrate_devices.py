@@ -48,9 +48,18 @@ def laser_plane(command: ArgumentParser) -> None:
     Examples:
       phalanx calibrate wrist laser-plane RECORDING --board 9x6 --square-mm 15 --rig wrist --out calib_json
       phalanx calibrate wrist laser-plane images --board 9x6 --square-mm 15 --rig wrist --picture plane.png
+      phalanx calibrate wrist laser-plane cloud.ply --unit mm --rig wrist --out calib_json
     """
-    add_lit_views(command)
-    add_board(command)
+    text = (
+        "a recording; a folder of VIEW_laser.png, each with VIEW_ambient.png, with VIEW_board.png (no laser), or "
+        "alone, if it shows the board too; or a point cloud in the camera frame, .ply, .csv, .xyz, .txt"
+    )
+    add_path(command, "source", "SOURCE", text)
+    shape = "of pictures: inner corners of a checkerboard, squares of a ChArUco board (--marker-mm)"
+    add_text(command, "--board", "COLUMNSxROWS", shape)
+    add_number(command, "--square-mm", "MM", "of pictures: side of a square, measured on the print")
+    add_markers_of_board(command)
+    add_choice(command, "--unit", ("m", "mm"), "of a cloud that does not state its own")
     add_recording_rig(command)
     add_calibration(command)
     add_results(command, "the lines and what is left of them")

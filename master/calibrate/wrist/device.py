@@ -9,7 +9,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import cast
 
+import cv2
 import numpy as np
 
 from common.arrays import Float, Image
@@ -87,7 +89,7 @@ def write_device(out: Path | None, device: Device, rig: RigCalibration, keys: st
     return written
 
 
-_NAMED = re.compile(r"(.*?)[-_ .]?(ambient|laser|led)", re.IGNORECASE)
+_NAMED = re.compile(r"(.*?)[-_ .]?(ambient|laser|led|board)", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +113,8 @@ def lit_views(folder: Path, camera: str, needed: Illumination) -> tuple[LitView,
     """Views with an ambient frame and one lit by `needed`, spread evenly, at most 60.
 
     From a recording whose frames.csv names the light of each frame, or images VIEW_ambient.png,
-    VIEW_laser.png, VIEW_led.png.
+    VIEW_laser.png, VIEW_led.png or VIEW_board.png, which is the board in any light but the laser's. A laser's
+    frame needs no ambient one (`laser_line`).
 
     Raises:
         RecordingError: No such folder, or no such frames; the text states what is expected.
@@ -119,11 +122,13 @@ def lit_views(folder: Path, camera: str, needed: Illumination) -> tuple[LitView,
     if not folder.is_dir():
         raise RecordingError(f"{folder}: is not a folder")
     views = _recorded(folder, camera) if (folder / MANIFEST).is_file() else _named(folder)
-    whole = [view for view in views if {Illumination.AMBIENT, needed} <= view.frames.keys()]
+    wanted = {needed} if needed is Illumination.LASER else {Illumination.AMBIENT, needed}
+    whole = [view for view in views if wanted <= view.frames.keys()]
     if not whole:
         raise RecordingError(
             f"{folder}: no frame lit by the {needed} with an ambient one beside it: a recording states in frames.csv"
             f" what lit each frame; images are named VIEW_ambient.png, VIEW_{needed}.png"
+            + (" (a laser's frame that shows the board may stand alone)" if len(wanted) == 1 else "")
         )
     most_views = 60  # more of the same motion adds time, not knowledge
     chosen = np.unique(np.linspace(0, len(whole) - 1, min(most_views, len(whole))).round().astype(int))
@@ -131,18 +136,23 @@ def lit_views(folder: Path, camera: str, needed: Illumination) -> tuple[LitView,
 
 
 def _recorded(folder: Path, camera: str) -> list[LitView]:
-    """A view for each ambient frame, with frames lit otherwise in its strobe cycle."""
+    """A view for each ambient frame, with frames lit otherwise in its strobe cycle.
+
+    Without any ambient frame, a view for each frame of the laser.
+    """
     rows = open_recording(folder).frames_of(camera)
     if not rows:
         raise RecordingError(f"{folder}: camera {camera!r} has no frame")
     views: list[LitView] = []
+    lit = {row.illumination for row in rows}
+    first = Illumination.AMBIENT if Illumination.AMBIENT in lit else Illumination.LASER
     for i, row in enumerate(rows):
-        if row.illumination is not Illumination.AMBIENT:
+        if row.illumination is not first:
             continue
         cycle: dict[Illumination, FrameRow] = {row.illumination: row}
         apart = 2  # rows: frames of one strobe cycle
         for near in rows[i + 1 : i + 1 + apart]:
-            if near.illumination is Illumination.AMBIENT or near.seq - row.seq > apart:
+            if near.illumination is first or near.seq - row.seq > apart:
                 break
             cycle.setdefault(near.illumination, near)
         frames = {lit: partial(load_grey, folder / one.file) for lit, one in cycle.items()}
@@ -155,7 +165,9 @@ def _named(folder: Path) -> list[LitView]:
     for file in sorted(folder.iterdir()):
         match = _NAMED.fullmatch(file.stem)
         if match is not None and file.suffix.lower() in ENDINGS:
-            found.setdefault(match[1], {})[Illumination(match[2].lower())] = partial(load_grey, file)
+            lit = match[2].lower()
+            lit = Illumination.LED if lit == "board" else Illumination(lit)
+            found.setdefault(match[1], {})[lit] = partial(load_grey, file)
     return [LitView(name or "0", frames) for name, frames in found.items()]
 
 
@@ -195,22 +207,33 @@ def lens_of_model(optics: CameraModel) -> Float:
 
 
 def board_pose(view: LitView, board: Board, optics: CameraModel) -> BoardPose:
-    """Board pose of one view, at the middle of its strobe cycle if both ends show it.
+    """Board pose of one view (`board_corners_of`)."""
+    return place_corners(board_corners_of(view, board, optics), board, optics)
+
+
+def board_corners_of(view: LitView, board: Board, optics: CameraModel) -> Float:
+    """Corners (N, 2) [px] of one view, in the middle of its strobe cycle.
+
+    Where both ends of the cycle show them; from the laser's frame only if nothing else does, its line taken out.
 
     Raises:
         RecordingError: An image cannot be read.
         FitError: No board, a wrong one, or one that moved; the text is the reason.
     """
     seen: list[Float] = []
-    for lit in (Illumination.AMBIENT, Illumination.LED):
+    for lit in (Illumination.AMBIENT, Illumination.LED, Illumination.LASER):
         image = view.load(lit)
-        if image is None:
+        if image is None or (lit is Illumination.LASER and seen):
             continue
         if image.shape != (optics.height_px, optics.width_px):
             raise FitError(
                 f"its image is {image.shape[1]} x {image.shape[0]} px,"
                 f" the camera {optics.width_px} x {optics.height_px}"
             )
+        if lit is Illumination.LASER:
+            # A line is thinner than this; of a square's corner, which looks the same turned by 180 deg, the place stays.
+            line_px = 7
+            image = cast(Image, cv2.morphologyEx(image, cv2.MORPH_OPEN, np.ones((line_px, line_px))))
         if (observation := find_board(board, image)) is not None:
             seen.append(observation.corners_px)
     if not seen:
@@ -220,7 +243,7 @@ def board_pose(view: LitView, board: Board, optics: CameraModel) -> BoardPose:
     moved = float(np.nanmedian(np.linalg.norm(seen[0] - seen[-1], axis=1)))
     if not moved <= 1.0:
         raise FitError(f"the board moved by {moved:.1f} px between the frames: hold it still")
-    return place_corners(np.mean(seen, axis=0), board, optics)
+    return np.mean(seen, axis=0)
 
 
 def place_corners(corners_px: Float, board: Board, optics: CameraModel) -> BoardPose:

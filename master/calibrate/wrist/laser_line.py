@@ -1,19 +1,21 @@
 """A laser's line is found on a board, in pictures.
 
 It is sought in the board's own plane, where it is straight: the difference (laser - ambient) is laid out flat
-by the pose of the board. Only what lies within the board's squares counts, so that a line on the table beside it
+by the pose of the board. Where there is no ambient frame, the squares' own light, a plane through the levels of
+each, is taken off instead. Only what lies within the board's squares counts, so that a line on the table beside it
 cannot. The brightest straight line is found by consensus; then, in steps of a pixel, its profile across is
 centred with a Gaussian window that moves until it rests. Profiles near the borders of squares are rejected: there
 the paper, not the light, makes the slope.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import map_coordinates
 
-from common.arrays import Float, Image
+from common.arrays import Bool, Float, Image, Int
 from common.errors import FitError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import transform
@@ -38,40 +40,117 @@ class BoardLine:
 
 
 def line_on_board(
-    laser: Image, ambient: Image, placed: BoardPose, board: Board, optics: CameraModel
+    laser: Image, ambient: Image | None, placed: BoardPose, board: Board, optics: CameraModel
 ) -> BoardLine:
     """Points of the laser's line on the board, from frames (H, W).
+
+    Without an ambient frame the board may be lit in the laser's own.
 
     Raises:
         FitError: There is no line across the board; the text is the reason.
     """
-    difference = np.asarray(laser, np.float32) - np.asarray(ambient, np.float32)
+    image = np.asarray(laser, np.float32) - (0.0 if ambient is None else np.asarray(ambient, np.float32))
     pixel_m = float(placed.centre_m[2]) / float(np.sqrt(optics.matrix[0, 0] * optics.matrix[1, 1]))
-    flat, at, texel_m = _laid_flat(difference, placed.T_camera_board, board, pixel_m, optics)
+    light = _BoardLight(image, placed.T_camera_board, board, optics)
+    at, texel_m = _texels(board, pixel_m)
+    if ambient is None:
+        light = light.without_squares(at, pixel_m)
+    flat = light(at)
+    known = np.isfinite(flat)
+    if not known.any():
+        raise FitError(
+            "the board is outside the image" if ambient is not None else "its squares are saturated"
+        )
+    flat, at = flat[known], at[known]
     background = float(np.median(flat))
     noise = 1.4826 * float(np.median(np.abs(flat - background))) + 0.5
     point, along = _brightest_line(flat - background, at, noise, 1.5 * texel_m)
-    coarse = _profiles(difference, point, along, pixel_m, noise, placed, board, optics)
-    found = _profiles(difference, coarse.point, coarse.along, pixel_m, noise, placed, board, optics)
+    coarse = _profiles(light, point, along, pixel_m, noise, placed, board)
+    found = _profiles(light, coarse.point, coarse.along, pixel_m, noise, placed, board)
     return BoardLine(found.points_m, optics.project(found.points_m), found.sigma_px, found.rms_px)
 
 
-def _laid_flat(
-    difference: Grey, T: Float, board: Board, pixel_m: float, optics: CameraModel
-) -> tuple[Float, Float, float]:
-    """Values (n,), places (n, 2) [m] on the board's plane, and a texel's side [m]."""
+def _texels(board: Board, pixel_m: float) -> tuple[Float, float]:
+    """Places (n, 2) [m] on the board's plane, and a texel's side [m]."""
     rows, columns = grid_shape(board)
     side = board.square_m
     texel_px = 0.6
     most_texels = 900  # per side
     texel = max(texel_px * pixel_m, max(columns + 1, rows + 1) * side / most_texels)
     x, y = np.meshgrid(np.arange(-side, columns * side, texel), np.arange(-side, rows * side, texel))
-    uv = optics.project(transform(T, np.stack([x, y, np.zeros_like(x)], axis=-1)))
-    values = _sampled(difference, uv)
-    known = np.isfinite(values)
-    if not known.any():
-        raise FitError("the board is outside the image")
-    return values[known], np.stack([x[known], y[known]], axis=1), texel
+    return np.stack([x.ravel(), y.ravel()], axis=1), texel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _BoardLight:
+    """Levels on the board's plane, of an image (H, W)."""
+
+    image: Grey
+    T_camera_board: Float
+    board: Board
+    optics: CameraModel
+    squares: Float | None = None  # (rows + 1, columns + 1, 3) level of each, and its slopes; NaN: not usable
+    border_m: float = 0.0  # what is nearer to a border of squares is not known
+
+    def __call__(self, xy: Float) -> Float:
+        """Levels (...) at places (..., 2) [m]; NaN: outside, or not known."""
+        flat = np.concatenate([xy, np.zeros((*xy.shape[:-1], 1))], axis=-1)
+        values = _sampled(self.image, self.optics.project(transform(self.T_camera_board, flat)))
+        if self.squares is None:
+            return values
+        cell, terms, clear = self._in_squares(xy)
+        return np.where(
+            clear, values - (self.squares[cell[..., 1], cell[..., 0]] * terms).sum(axis=-1), np.nan
+        )
+
+    def _in_squares(self, xy: Float) -> tuple[Int, Float, Bool]:
+        """Numbers (..., 2) of squares, terms (..., 3) of their levels, clear of borders."""
+        side = self.board.square_m
+        cell = np.floor(xy / side).astype(np.int64)
+        within = xy / side - cell - 0.5
+        rows, columns = grid_shape(self.board)
+        clear = (0.5 - np.abs(within)).min(axis=-1) * side > self.border_m
+        clear &= ((cell >= -1) & (cell < [columns, rows])).all(axis=-1)
+        cell = np.clip(cell + 1, 0, [columns, rows])
+        return cell, np.concatenate([np.ones_like(within[..., :1]), within], axis=-1), clear
+
+    def without_squares(self, at: Float, pixel_m: float) -> "_BoardLight":
+        """The same less the board's own light, which is measured at places (n, 2).
+
+        A square is left out where it is saturated, or has a print of its own, such as a marker.
+        """
+        border_px = 2.0  # of the lens and of the pose, which blur borders
+        near = replace(self, squares=None, border_m=border_px * pixel_m)
+        values = self(at)
+        cell, terms, clear = near._in_squares(at)
+        clear &= np.isfinite(values)
+        rows, columns = grid_shape(self.board)
+        squares, spread = (
+            np.full((rows + 1, columns + 1, 3), np.nan),
+            np.full((rows + 1, columns + 1), np.nan),
+        )
+        for j, i in np.ndindex(rows + 1, columns + 1):
+            own = clear & (cell == [i, j]).all(axis=1)
+            brightest = 250.0  # levels: what is saturated shows no line
+            if own.sum() < 30 or np.median(values[own]) >= brightest:
+                continue
+            squares[j, i], spread[j, i] = _level_plane(terms[own], values[own])
+        printed = (
+            spread > 3.0 * np.nanquantile(spread, 0.25) + 2.0 if np.isfinite(spread).any() else spread > 0
+        )
+        squares[printed] = np.nan
+        return replace(near, squares=squares)
+
+
+def _level_plane(terms: Float, values: Float) -> tuple[Float, float]:
+    """Level and slopes (3,) of a square, whose line is an outlier, and robust spread."""
+    found, limit = np.array([np.median(values), 0.0, 0.0]), np.inf
+    for _ in range(4):
+        off = np.abs(values - terms @ found)
+        limit = 1.4826 * float(np.median(off)) + 0.3
+        own = off < 3.0 * limit
+        found = np.linalg.lstsq(terms[own], values[own], rcond=None)[0]
+    return found, limit
 
 
 def _brightest_line(values: Float, at: Float, noise: float, within_m: float) -> tuple[Float, Float]:
@@ -110,14 +189,13 @@ class _Centred:
 
 
 def _profiles(
-    difference: Grey,
+    light: _BoardLight,
     point: Float,
     along: Float,
     pixel_m: float,
     noise: float,
     placed: BoardPose,
     board: Board,
-    optics: CameraModel,
 ) -> _Centred:
     """Centre the line in profiles a pixel apart, and fit a straight line to that."""
     rows, columns = grid_shape(board)
@@ -139,34 +217,40 @@ def _profiles(
     step_px = 0.25
     d = np.arange(-reach_px, reach_px + 0.5 * step_px, step_px)
     places = base[:, None] + (d[:, None] * pixel_m) * across
-    flat = np.concatenate([places, np.zeros((*places.shape[:2], 1))], axis=-1)
-    profile = _sampled(difference, optics.project(transform(placed.T_camera_board, flat)))
-    whole = np.isfinite(profile).all(axis=1)
+    profile = light(places)
+    beside = np.abs(d) > 0.6 * reach_px
+    if light.squares is None:
+        whole = np.isfinite(profile).all(axis=1)
+    else:  # a border of squares beside the line is not known
+        known = np.isfinite(profile)
+        whole = known[:, ~beside].all(axis=1) & (known[:, beside].mean(axis=1) > 0.3)
     s, profile = s[whole], profile[whole]
-    light = profile - np.median(profile[:, np.abs(d) > 0.6 * reach_px], axis=1)[:, None]
+    if not len(s):
+        raise FitError(_TOO_SHORT)
+    level = np.nan_to_num(profile - np.nanmedian(profile[:, beside], axis=1)[:, None])
     # Wider than what is brighter than half of it: on the flat top of a saturated line a narrow one would rest anywhere.
-    half = 0.5 * step_px * (light > 0.5 * light.max(axis=1, initial=0.0)[:, None]).sum(axis=1)
+    half = 0.5 * step_px * (level > 0.5 * level.max(axis=1, initial=0.0)[:, None]).sum(axis=1)
     window_px = 1.6  # standard deviation of the window: a little wider than the line ...
     # ... that is, than the half of it that is brighter than its half
     window = np.maximum(window_px, 1.2 * half)[:, None]
     centre = np.zeros(len(s))
     for _ in range(8):
-        weight = light * np.exp(-0.5 * ((d - centre[:, None]) / window) ** 2)
+        weight = level * np.exp(-0.5 * ((d - centre[:, None]) / window) ** 2)
         total = weight.sum(axis=1)
         centre = np.where(total > 0, (weight * d).sum(axis=1) / np.where(total > 0, total, 1.0), np.nan)
-    height = light[np.arange(len(s)), np.abs(d - np.nan_to_num(centre)[:, None]).argmin(axis=1)]
+    height = level[np.arange(len(s)), np.abs(d - np.nan_to_num(centre)[:, None]).argmin(axis=1)]
     # A line stands out from what is beside it; an even light, as that of the LEDs, does not.
-    flank = np.abs(light[:, np.abs(d) > 0.6 * reach_px]).max(axis=1, initial=0.0)
+    flank = np.abs(level[:, beside]).max(axis=1, initial=0.0)
     good = (np.abs(centre) < 0.5 * reach_px) & (height > _NOISE_TIMES * noise) & (height > 3.0 * flank)
     s, centre = s[good], centre[good]
     if len(s) < _MIN_PROFILES or np.ptp(s) < side:
         raise FitError(_TOO_SHORT)
     kept = np.ones(len(s), dtype=np.bool_)
-    slope = level = 0.0
+    slope = shift = 0.0
     off = centre
     for _ in range(4):
-        slope, level = np.polyfit(s[kept], centre[kept], 1)
-        off = centre - (slope * s + level)
+        slope, shift = np.polyfit(s[kept], centre[kept], 1)
+        off = centre - (slope * s + shift)
         scatter = max(1.4826 * float(np.median(np.abs(off[kept]))), 0.03)
         kept = np.abs(off) < 3.0 * scatter
     if kept.sum() < max(_MIN_PROFILES, 0.5 * len(s)):
@@ -177,14 +261,10 @@ def _profiles(
     tilted = along + slope * pixel_m * across
     line_floor_px = 0.015  # of a line's place: speckle and paper that no number of profiles averages out
     sigma = float(np.hypot(rms / np.sqrt(kept.sum()), line_floor_px))
-    return _Centred(point + level * pixel_m * across, tilted / np.linalg.norm(tilted), points, sigma, rms)
+    return _Centred(point + shift * pixel_m * across, tilted / np.linalg.norm(tilted), points, sigma, rms)
 
 
 def _sampled(image: Grey, uv: Float) -> Float:
     """Values (...) of a float image (H, W) at uv (..., 2), interpolated; NaN outside."""
-    height, width = image.shape
-    u, v = np.moveaxis(uv.astype(np.float32), -1, 0)
-    inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
-    u, v = np.atleast_2d(np.where(inside, u, 0.0)), np.atleast_2d(np.where(inside, v, 0.0))
-    found = cv2.remap(image, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
-    return np.where(inside, np.asarray(found, np.float64).reshape(inside.shape), np.nan)
+    u, v = np.moveaxis(uv, -1, 0)
+    return np.asarray(map_coordinates(image, [v, u], order=1, cval=np.nan, output=np.float64), np.float64)

@@ -8,9 +8,8 @@ well, and what is not known to a tenth of a degree and of a millimetre is refuse
 """
 
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -18,8 +17,8 @@ from msgspec.structs import replace
 
 from common.arrays import Bool, Float
 from common.calibration import RigCalibration
-from common.calibration.rig import LaserPlane
-from common.command_line import echo
+from common.calibration.rig import LASER_ACROSS, LaserPlane
+from common.command_line import UsageError, echo
 from common.errors import FitError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import cross
@@ -31,16 +30,16 @@ from master.calibrate.wrist.device import (
     BoardPose,
     Device,
     LitView,
-    board_pose,
+    board_corners_of,
     device_of,
     grouped_by_reason,
     lit_views,
+    place_corners,
     write_device,
 )
 from master.calibrate.wrist.laser_line import BoardLine, line_on_board
 
-NORMAL_LIMIT_RAD = np.radians(0.1)
-_WRONG_CHI2 = 22.0  # of two degrees of freedom: one in 60 000
+NORMAL_LIMIT_RAD, _OFFSET_LIMIT_M = np.radians(0.1), 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,12 +56,7 @@ class ViewLine:
     @classmethod
     def of(cls, name: str, line: BoardLine, placed: BoardPose, focal_px: float) -> "ViewLine":
         """Reduce a line to two points."""
-        mean = line.points_m.mean(axis=0)
-        _, sizes, axes = np.linalg.svd(line.points_m - mean, full_matrices=False)
-        spread = sizes[0] / np.sqrt(len(line.points_m)) * axes[0]
-        return cls(
-            name, line.points_m, np.stack([mean - spread, mean + spread]), placed, line.sigma_px, focal_px
-        )
+        return cls(name, line.points_m, two_points(line.points_m), placed, line.sigma_px, focal_px)
 
     def covariance(self, normal: Float) -> Float:
         """(2, 2) [m^2] of the distances of both ends from a plane with this normal.
@@ -101,6 +95,49 @@ class PlaneFit:
         return float(np.sqrt(self.covariance[3, 3]))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Lines:
+    """V straight lines in space, each by two points with mean and spread of its own."""
+
+    ends_m: Float  # (V, 2, 3)
+    points_m: tuple[Float, ...]  # V times (n, 3)
+    covariance: Callable[
+        [Float], Float
+    ]  # (V, 2, 2) [m^2] of the distances of `ends_m` from a plane, by its normal
+    off_m: float = 0.0  # what is less off than this is not wrong, however sure it claims to be
+    dof: float = 2.0  # numbers that a line measures; 1 for single points
+
+    def chi2(self, normal: Float, offset: float) -> Float:
+        """(V,) of the distances from a plane."""
+        off = self.ends_m @ normal - offset
+        return np.vecdot(off, np.linalg.solve(self.covariance(normal), off[..., None])[..., 0])
+
+    def off(self, normal: Float, offset: float) -> Float:
+        """(V,) rms distances [m] of the points."""
+        return np.sqrt(((self.ends_m @ normal - offset) ** 2).mean(axis=1))
+
+    def agreeing(self, normal: Float, offset: float) -> Bool:
+        """Which lines (V,) agree with a plane.
+
+        The covariances may be small by a common factor: a wrong line is one whose residual is larger than most.
+        """
+        chi2, (middle, wrong) = self.chi2(normal, offset), _CHI2[self.dof]
+        times = max(1.0, float(np.median(chi2)) / middle)
+        return (chi2 < wrong * times) | (self.off(normal, offset) < self.off_m)
+
+
+_CHI2 = {2.0: (1.386, 22.0), 1.0: (0.455, 18.5)}
+"""By degrees of freedom: the median, and what one in 60 000 exceeds."""
+
+
+def two_points(points_m: Float) -> Float:
+    """Two points (2, 3) with the mean and the spread of a line's points (n, 3)."""
+    mean = points_m.mean(axis=0)
+    _, sizes, axes = np.linalg.svd(points_m - mean, full_matrices=False)
+    spread = sizes[0] / np.sqrt(len(points_m)) * axes[0]
+    return np.stack([mean - spread, mean + spread])
+
+
 def fit_plane(views: Sequence[ViewLine]) -> PlaneFit:
     """The plane through the lines of at least three views.
 
@@ -114,39 +151,74 @@ def fit_plane(views: Sequence[ViewLine]) -> PlaneFit:
             f"the line is seen on the board in {len(views)} views, at least {min_views} are needed (better 10), each"
             " with the board at another distance and tilt"
         )
-    normal, offset = _consensus(views)
-    used, cov = np.zeros(len(views), dtype=np.bool_), np.eye(4)
-    for _ in range(6):
-        good = _agreeing(views, normal, offset)
-        if (good == used).all():
-            break
-        used = good
-        if used.sum() < max(min_views, (len(views) + 1) // 2):
-            raise FitError(
-                f"only {int(used.sum())} of {len(views)} views agree on one plane: is the laser fixed to the camera,"
-                " and the board flat? Views with the line on something else than the board must be taken anew"
-            )
-        normal, offset, cov = _least_squares([v for v, own in zip(views, used, strict=True) if own], normal)
-    cov = cov * max(1.0, _reduced(views, used, normal, offset))
-    off = np.array([_off(view, normal, offset) for view in views])
-    points = np.concatenate([view.points_m for view, own in zip(views, used, strict=True) if own])
-    rms = float(np.sqrt(np.mean((points @ normal - offset) ** 2)))
-    fit = PlaneFit(LaserPlane(normal=_vector(normal), offset_m=round(float(offset), 9)), cov, rms, used, off)
-    _refuse_unsure(fit, points)
+    lines = Lines(
+        np.stack([view.ends_m for view in views]),
+        tuple(view.points_m for view in views),
+        lambda normal: np.stack([view.covariance(normal) for view in views]),
+        off_m=1.5e-4,
+    )
+    fit = settled(lines, consensus(lines), max(min_views, (len(views) + 1) // 2))
+    if fit is None:
+        used = int(lines.agreeing(*consensus(lines)).sum())
+        raise FitError(
+            f"only {used} of {len(views)} views agree on one plane: is the laser fixed to the camera,"
+            " and the board flat? Views with the line on something else than the board must be taken anew"
+        )
+    _refuse_unsure(
+        fit, np.concatenate([one for one, own in zip(lines.points_m, fit.used, strict=True) if own])
+    )
     return fit
 
 
-def _consensus(views: Sequence[ViewLine]) -> tuple[Float, float]:
-    """Normal and offset of the plane through two lines that most others agree with."""
-    pairs: list[tuple[int, int]] = list(combinations(range(len(views)), 2))
-    most_pairs = 300
-    if len(pairs) > most_pairs:
-        chosen = np.random.default_rng(0).choice(len(pairs), most_pairs, replace=False)
-        pairs = [pairs[int(i)] for i in chosen]
+def settled(lines: Lines, plane: tuple[Float, float], fewest: int) -> PlaneFit | None:
+    """Least squares over lines that agree with a first plane; None: too few."""
+    (normal, offset), cov = plane, np.eye(4)
+    used = np.zeros(len(lines.ends_m), dtype=np.bool_)
+    for _ in range(6):
+        good = lines.agreeing(normal, offset)
+        if (good == used).all():
+            break
+        used = good
+        if used.sum() < fewest:
+            return None
+        normal, offset, cov = _least_squares(lines, used, normal)
+    return _fit_of(lines, used, normal, offset, cov)
+
+
+def over_all(lines: Lines) -> PlaneFit:
+    """Least squares over all lines."""
+    used = np.ones(len(lines.ends_m), dtype=np.bool_)
+    return _fit_of(lines, used, *_least_squares(lines, used, _through(lines.ends_m.reshape(-1, 3))[0]))
+
+
+def _fit_of(lines: Lines, used: Bool, normal: Float, offset: float, cov: Float) -> PlaneFit:
+    reduced = float(lines.chi2(normal, offset)[used].sum()) / max(lines.dof * float(used.sum()) - 3.0, 1.0)
+    off = lines.off(normal, offset)
+    count = np.array([len(one) for one in lines.points_m])
+    rms = float(np.sqrt((count * off**2)[used].sum() / count[used].sum()))
+    plane = LaserPlane(normal=_vector(normal), offset_m=round(float(offset), 9))
+    return PlaneFit(plane, cov * max(1.0, reduced), rms, used, off)
+
+
+def consensus(lines: Lines, *, known_sigma: bool = True) -> tuple[Float, float]:
+    """Normal and offset of the plane through a few lines that most others agree with.
+
+    Where the lines' sigma is not known, the one of the least median of squares (Rousseeuw 1984).
+    """
+    few = 2 if lines.dof > 1.0 else 3  # lines, or points, that make a plane
+    count, most = len(lines.ends_m), 300
+    rng = np.random.default_rng(0)
+    if few == 2 and count * (count - 1) // 2 <= 10 * most:
+        chosen = np.array(list(combinations(range(count), 2)))
+        chosen = chosen[rng.choice(len(chosen), most, replace=False)] if len(chosen) > most else chosen
+    else:
+        chosen = rng.integers(0, count, (most, few))
     best, cost = (np.array([0.0, 1.0, 0.0]), 0.0), np.inf
-    for i, j in pairs:
-        normal, offset = _through(np.concatenate([views[i].ends_m, views[j].ends_m]))
-        own = sum(min(_chi2(view, normal, offset), _WRONG_CHI2) for view in views)
+    wrong = _CHI2[lines.dof][1]
+    for some in chosen:
+        normal, offset = _through(lines.ends_m[some].reshape(-1, 3))
+        chi2 = lines.chi2(normal, offset)
+        own = float(np.minimum(chi2, wrong).sum() if known_sigma else np.median(chi2))
         if own < cost:
             best, cost = (normal, offset), own
     return best
@@ -155,41 +227,26 @@ def _consensus(views: Sequence[ViewLine]) -> tuple[Float, float]:
 def _through(points: Float) -> tuple[Float, float]:
     """Plane of least squares through points (n, 3); offset positive."""
     mean = points.mean(axis=0)
-    normal = np.linalg.svd(points - mean)[2][2]
+    normal = np.linalg.svd(points - mean, full_matrices=False)[2][-1]
     normal = normal * (1.0 if normal @ mean >= 0 else -1.0)
     return normal, float(normal @ mean)
 
 
-def _chi2(view: ViewLine, normal: Float, offset: float) -> float:
-    off = view.ends_m @ normal - offset
-    return float(off @ np.linalg.solve(view.covariance(normal), off))
-
-
-def _off(view: ViewLine, normal: Float, offset: float) -> float:
-    return float(np.sqrt(np.mean((view.points_m @ normal - offset) ** 2)))
-
-
-def _agreeing(views: Sequence[ViewLine], normal: Float, offset: float) -> Bool:
-    """Which views (V,) agree with a plane."""
-    chi2 = np.array([_chi2(view, normal, offset) for view in views])
-    off = np.array([_off(view, normal, offset) for view in views])
-    # The covariances may be small by a common factor: a wrong view is one whose residual is larger than most.
-    times = max(1.0, float(np.median(chi2)) / 1.386)
-    wrong_m = 1.5e-4  # a view that is less off than this is not wrong, however sure it claims to be
-    return (chi2 < _WRONG_CHI2 * times) | (off < wrong_m)
-
-
-def _reduced(views: Sequence[ViewLine], used: Bool, normal: Float, offset: float) -> float:
-    """Chi square per degree of freedom."""
-    total = sum(_chi2(view, normal, offset) for view, own in zip(views, used, strict=True) if own)
-    return total / max(2.0 * float(used.sum()) - 3.0, 1.0)
-
-
-def _least_squares(views: Sequence[ViewLine], normal: Float) -> tuple[Float, float, Float]:
+def _least_squares(lines: Lines, used: Bool, normal: Float) -> tuple[Float, float, Float]:
     """Normal, offset, covariance (4, 4), from a first normal."""
-    middle = np.concatenate([view.ends_m for view in views]).mean(axis=0)
+    middle = lines.ends_m[used].reshape(-1, 3).mean(axis=0)
+    arm = lines.ends_m[used] - middle
+
+    def equations(plane: Float) -> Normal:
+        """Of a plane: normal, distance from the middle."""
+        out, normal = Normal(3), plane[:3]
+        whiten = np.linalg.inv(np.linalg.cholesky(lines.covariance(normal)[used]))
+        by = np.concatenate([arm @ _tangents(normal), -np.ones((*arm.shape[:2], 1))], axis=2)
+        out.add((whiten @ (arm @ normal - plane[3])[..., None])[..., 0], whiten @ by)
+        return out
+
     # By turn of the normal and distance from the middle, which hardly depend on each other.
-    found = minimise(partial(_equations, views, middle), _stepped, np.append(normal, 0.0), steps=20)
+    found = minimise(equations, _stepped, np.append(normal, 0.0), steps=20)
     normal, tangents = found.x[:3], _tangents(found.x[:3])
     offset = float(normal @ middle + found.x[3])
     to4 = np.zeros((4, 3))
@@ -197,16 +254,6 @@ def _least_squares(views: Sequence[ViewLine], normal: Float) -> tuple[Float, flo
     to4[3] = np.append(middle @ tangents, 1.0)
     sign = -1.0 if offset < 0.0 else 1.0
     return sign * normal, sign * offset, to4 @ found.normal.covariance() @ to4.T
-
-
-def _equations(views: Sequence[ViewLine], middle: Float, plane: Float) -> Normal:
-    """Normal equations of a plane (normal, distance from the middle)."""
-    out, normal, tangents = Normal(3), plane[:3], _tangents(plane[:3])
-    for view in views:
-        whiten, arm = np.linalg.inv(np.linalg.cholesky(view.covariance(normal))), view.ends_m - middle
-        by = np.concatenate([arm @ tangents, -np.ones((2, 1))], axis=1)
-        out.add((whiten @ (arm @ normal - plane[3]))[None], (whiten @ by)[None])
-    return out
 
 
 def _stepped(plane: Float, step: Float, _own: Float) -> Float:
@@ -221,15 +268,14 @@ def _tangents(normal: Float) -> Float:
 
 def _refuse_unsure(fit: PlaneFit, points: Float) -> None:
     """Refuse points on one line, and a plane that is too uncertain."""
-    offset_limit_m = 1e-4
-    if fit.normal_sigma_rad <= NORMAL_LIMIT_RAD and fit.offset_sigma_m <= offset_limit_m:
+    if fit.normal_sigma_rad <= NORMAL_LIMIT_RAD and fit.offset_sigma_m <= _OFFSET_LIMIT_M:
         return
     wide = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
     if wide[1] < max(5.0 * fit.rms_m, 0.1 * wide[0]):
         raise FitError(_collinear(wide[1]))
     raise FitError(
         f"the plane is known to {np.degrees(fit.normal_sigma_rad):.2f} deg and {1e3 * fit.offset_sigma_m:.2f} mm only"
-        f" (limits {np.degrees(NORMAL_LIMIT_RAD):.1f} deg, {1e3 * offset_limit_m:.1f} mm): show the board in more"
+        f" (limits {np.degrees(NORMAL_LIMIT_RAD):.1f} deg, {1e3 * _OFFSET_LIMIT_M:.1f} mm): show the board in more"
         " views, nearer and farther, so large that it fills a third of the image"
     )
 
@@ -255,7 +301,13 @@ class LinesSeen:
 
 
 def laser_plane(options: Namespace) -> None:
-    """Measure the plane of a wrist device's laser, from ten views of a board."""
+    """Measure the plane of a wrist device's laser, from views of a board or a cloud."""
+    if options.source.is_file():
+        return _of_cloud(options)
+    if options.board is None or options.square_mm is None:
+        raise UsageError("of pictures: give --board COLUMNSxROWS and --square-mm MM")
+    if options.unit is not None:
+        raise UsageError("--unit is that of a cloud, and SOURCE is a folder")
     device = device_of(options.source, options.rig, options.calibration, options.out)
     views = lit_views(options.source, device.camera.name, Illumination.LASER)
     seen = lines_of(views, board_in(options), device.optics)
@@ -267,8 +319,36 @@ def laser_plane(options: Namespace) -> None:
 
         draw_plane(options.picture, fit, seen.lines, device.optics)
         echo(f"drew {options.picture}")
-    written = write_device(options.out, device, rig_with_plane(device, fit), "laser_plane")
+    note = f"{int(fit.used.sum())} of {len(fit.used)} views of a board"
+    written = write_device(options.out, device, rig_with_plane(device, fit, note), "laser_plane")
     write_report(options.json_file, report_json(fit, seen), written)
+    return None
+
+
+def _of_cloud(options: Namespace) -> None:
+    from master.calibrate.wrist.laser_cloud import fit_cloud, read_cloud
+
+    points = read_cloud(options.source, options.unit)
+    device = device_of(options.source, options.rig, options.calibration, options.out)
+    with refusals_named(options.source):
+        found = fit_cloud(points)
+    fit, used = found.fit, found.used
+    print_lines([f"laser plane from {used}, {1e3 * fit.rms_m:.3f} mm rms from it", *_plane_lines(fit)])
+    if found.over_all is not None:
+        print_lines(["over all points, outliers included (not written):", *_plane_lines(found.over_all)])
+    if fit.normal_sigma_rad > NORMAL_LIMIT_RAD or fit.offset_sigma_m > _OFFSET_LIMIT_M:
+        echo(
+            f"less certain than a board's views have to be ({np.degrees(NORMAL_LIMIT_RAD):.1f} deg,"
+            f" {1e3 * _OFFSET_LIMIT_M:.1f} mm)"
+        )
+    if options.picture is not None:
+        from master.calibrate.picture import draw_cloud
+
+        draw_cloud(options.picture, fit, points, np.repeat(fit.used, [len(p) for p in found.lines.points_m]))
+        echo(f"drew {options.picture}")
+    written = write_device(options.out, device, rig_with_plane(device, fit, used), "laser_plane")
+    over = {} if found.over_all is None else {"over_all": plane_json(found.over_all)}
+    write_report(options.json_file, plane_json(fit) | {"points": len(points)} | over, written)
 
 
 def lines_of(views: tuple[LitView, ...], board: Board, optics: CameraModel) -> LinesSeen:
@@ -281,14 +361,8 @@ def lines_of(views: tuple[LitView, ...], board: Board, optics: CameraModel) -> L
     lines: list[ViewLine] = []
     refused: dict[str, str] = {}
     for view in views:
-        laser, ambient = view.load(Illumination.LASER), view.load(Illumination.AMBIENT)
-        assert laser is not None  # `lit_views` gives whole ones
-        assert ambient is not None
         try:
-            placed = board_pose(view, board, optics)
-            if laser.shape != ambient.shape:
-                raise FitError("its frames differ in size")
-            line = line_on_board(laser, ambient, placed, board, optics)
+            placed, line = _line_of(view, board, optics)
         except FitError as error:
             refused[view.name] = str(error)
             continue
@@ -296,15 +370,33 @@ def lines_of(views: tuple[LitView, ...], board: Board, optics: CameraModel) -> L
     return LinesSeen(tuple(lines), refused)
 
 
+def _line_of(view: LitView, board: Board, optics: CameraModel) -> tuple[BoardPose, BoardLine]:
+    """The board of a view, and the laser's line on it."""
+    laser, ambient = view.load(Illumination.LASER), view.load(Illumination.AMBIENT)
+    assert laser is not None  # `lit_views` gives whole ones
+    if ambient is not None and laser.shape != ambient.shape:
+        raise FitError("its frames differ in size")
+    corners = board_corners_of(view, board, optics)
+    placed = place_corners(corners, board, optics)
+    line = line_on_board(laser, ambient, placed, board, optics)
+    if view.frames.keys() != {Illumination.LASER}:
+        return placed, line
+    # Corners near the line of the same picture are drawn towards it.
+    way = line.uv[-1] - line.uv[0]
+    across = np.array([-way[1], way[0]]) / np.linalg.norm(way)
+    near_px = 12.0
+    corners = np.where(np.abs((corners - line.uv[0]) @ across)[:, None] < near_px, np.nan, corners)
+    placed = place_corners(corners, board, optics)
+    return placed, line_on_board(laser, None, placed, board, optics)
+
+
 def report_lines(fit: PlaneFit, seen: LinesSeen, views: int) -> list[str]:
     """The result for a person."""
-    x, y, z = fit.plane.normal
     used = int(fit.used.sum())
     points = sum(len(line.points_m) for line, own in zip(seen.lines, fit.used, strict=True) if own)
     lines = [
         f"laser plane from {points} points in {used} of {views} views, {1e3 * fit.rms_m:.3f} mm rms from it",
-        f"  normal {x:+.5f} {y:+.5f} {z:+.5f}  ± {np.degrees(fit.normal_sigma_rad):.3f} deg",
-        f"  offset {1e3 * fit.plane.offset_m:.3f} ± {1e3 * fit.offset_sigma_m:.3f} mm",
+        *_plane_lines(fit),
     ]
     wrong = [
         f"view {line.name}: {1e3 * off:.2f} mm off the plane of the others"
@@ -317,8 +409,16 @@ def report_lines(fit: PlaneFit, seen: LinesSeen, views: int) -> list[str]:
     return lines
 
 
-def report_json(fit: PlaneFit, seen: LinesSeen) -> dict[str, object]:
-    """The same for programs."""
+def _plane_lines(fit: PlaneFit) -> list[str]:
+    x, y, z = fit.plane.normal
+    return [
+        f"  normal {x:+.5f} {y:+.5f} {z:+.5f}  ± {np.degrees(fit.normal_sigma_rad):.3f} deg",
+        f"  offset {1e3 * fit.plane.offset_m:.3f} ± {1e3 * fit.offset_sigma_m:.3f} mm",
+    ]
+
+
+def plane_json(fit: PlaneFit) -> dict[str, object]:
+    """A plane for programs."""
     return {
         "normal": list(fit.plane.normal),
         "offset_mm": 1e3 * fit.plane.offset_m,
@@ -326,6 +426,12 @@ def report_json(fit: PlaneFit, seen: LinesSeen) -> dict[str, object]:
         "offset_sigma_mm": round(1e3 * fit.offset_sigma_m, 6),
         "covariance_normal_offset_m": fit.covariance.tolist(),
         "rms_mm": round(1e3 * fit.rms_m, 6),
+    }
+
+
+def report_json(fit: PlaneFit, seen: LinesSeen) -> dict[str, object]:
+    """The same for programs."""
+    return plane_json(fit) | {
         "views": {
             line.name: {"rms_mm": round(1e3 * float(off), 6), "used": bool(own), "points": len(line.points_m)}
             for line, own, off in zip(seen.lines, fit.used, fit.off_m, strict=True)
@@ -334,14 +440,18 @@ def report_json(fit: PlaneFit, seen: LinesSeen) -> dict[str, object]:
     }
 
 
-def rig_with_plane(device: Device, fit: PlaneFit) -> RigCalibration:
+def rig_with_plane(device: Device, fit: PlaneFit, note: str) -> RigCalibration:
     """The device's rig with the new plane and where it comes from."""
     residual = {
         "rms_mm": round(1e3 * fit.rms_m, 4),
         "normal_sigma_deg": round(float(np.degrees(fit.normal_sigma_rad)), 4),
         "offset_sigma_mm": round(1e3 * fit.offset_sigma_m, 4),
     }
-    note = f"{int(fit.used.sum())} of {len(fit.used)} views of a board"
     how = provenance("calibrate wrist laser-plane", (device.source,), residual, note)
-    rig = device.rig
-    return replace(rig, laser_plane=fit.plane, provenance=rig.provenance | {"laser_plane": how})
+    rig, laser = device.rig, device.rig.laser
+    if laser is not None and laser.forward is not None:
+        leaves = abs(sum(a * b for a, b in zip(fit.plane.normal, laser.forward, strict=True)))
+        if leaves > LASER_ACROSS:
+            echo("laser.origin, forward and right of the rig file lie in another plane, and are left out")
+            laser = replace(laser, origin=None, forward=None, right=None)
+    return replace(rig, laser_plane=fit.plane, laser=laser, provenance=rig.provenance | {"laser_plane": how})

@@ -6,7 +6,8 @@ import pytest
 from common.arrays import Float
 from common.errors import FitError
 from common.geometry.transforms import rigid, rotation_vector_to_matrix
-from master.calibrate.wrist.device import BoardPose
+from common.recording.frame_recording import Illumination
+from master.calibrate.wrist.device import BoardPose, LitView
 from master.calibrate.wrist.laser_plane import ViewLine, fit_plane, lines_of
 from tests.master.calibrate.wrist.devices import (
     BOARD,
@@ -162,3 +163,44 @@ def test_views_that_contradict_each_other_are_refused() -> None:
     loose = [shifted(line, rng.normal(0.0, 0.01, 3)) for line in (*GOOD, *GOOD)]
     with pytest.raises(FitError, match=r"views agree on one plane|is known to|on one line"):
         fit_plane(loose)
+
+
+def lit_in_the_laser_frame(seed: int, count: int, *, board_apart: bool) -> tuple[LitView, ...]:
+    """Views without an ambient frame; the laser's shows the board, lit by the LEDs too."""
+    views: list[LitView] = []
+    for k, frames in enumerate(cycles_of(seed, count)):
+        line = frames[Illumination.LASER].astype(int) - frames[Illumination.AMBIENT]
+        both = np.clip(frames[Illumination.LED] // 2 + 30 + line, 0, 255).astype(np.uint8)
+        own = {Illumination.LASER: both}
+        if board_apart:
+            own[Illumination.LED] = frames[Illumination.LED]
+        views.append(view_of(str(k), own))
+    return tuple(views)
+
+
+@pytest.mark.parametrize("board_apart", [False, True])
+def test_a_board_that_is_lit_in_the_laser_frame_needs_no_ambient_one(*, board_apart: bool) -> None:
+    seed = 11
+    fit = fit_plane(lines_of(lit_in_the_laser_frame(seed, 6, board_apart=board_apart), BOARD, OPTICS).lines)
+    true = plane_of(seed)
+    assert fit.used.sum() >= 4
+    assert angle_deg(np.array(fit.plane.normal), np.array(true.normal)) < 0.05
+    assert 1e3 * abs(fit.plane.offset_m - true.offset_m) < 0.1
+
+
+def test_a_lit_board_without_a_line_is_refused() -> None:
+    frames = cycles_of(11, 6)
+    views = tuple(
+        view_of(str(k), {Illumination.LASER: one[Illumination.LED]}) for k, one in enumerate(frames)
+    )
+    seen = lines_of(views, BOARD, OPTICS)
+    assert not seen.lines
+    assert len(seen.refused) == 6
+
+
+def test_a_laser_that_moved_between_the_views_is_refused() -> None:
+    # Half of the views before, half after it was knocked: no majority.
+    after = [shifted(line, np.array([0.0, 0.004, 0.0])) for line in GOOD[2:]]
+    more = view_line("more", (15.0, -20.0, 0.0), (0.03, 0.0, 0.28))
+    with pytest.raises(FitError, match=r"only \d of \d views agree .* laser fixed|is known to"):
+        fit_plane((*GOOD[:2], *after, shifted(more, np.array([0.0, -0.004, 0.0]))))
