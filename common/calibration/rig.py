@@ -40,7 +40,9 @@ Place = tuple[Reach, Reach, Reach]
 Coefficient = Annotated[float, Meta(ge=-1e6, le=1e6)]
 
 
-LASER_ACROSS = 0.2  # by which a direction may leave the laser's plane: 12 degrees, far more than a line is bent
+LASER_ACROSS = (
+    0.2  # by which a direction may leave the laser's plane: 12 degrees, far more than a line is bent
+)
 
 
 class LaserPlane(Part, frozen=True):

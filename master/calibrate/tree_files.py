@@ -28,7 +28,6 @@ from common.calibration.object_profile import ObjectProfile
 from common.command_line import echo
 from common.errors import CalibrationError, FitError
 from common.geometry.camera_model import CameraModel
-from master.commands.summary import write_summary
 
 
 def provenance(tool: str, data: tuple[str, ...], residual: dict[str, float], note: str = "") -> Provenance:
@@ -129,16 +128,6 @@ def print_lines(lines: Iterable[str]) -> None:
     """Print lines for a person."""
     for line in lines:
         echo(line)
-
-
-def write_report(file: Path | None, report: dict[str, object], written: Path | None) -> None:
-    """Write the figures of a calibration as JSON, if asked for, and where it is.
-
-    Raises:
-        RecordingError: The file cannot be written.
-    """
-    if file is not None:
-        write_summary(file, report | {"written": None if written is None else str(written)})
 
 
 @contextmanager

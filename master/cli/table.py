@@ -74,7 +74,7 @@ TABLE: tuple[Command | Family, ...] = (
             "master.cli.calibrate_devices:subject", "master.calibrate.wrist.subject:subject"),
     Command("calibrate wrist extrinsics", _WRIST,
             "how it sits, how its IMU lies, and its clocks, before marker cameras",
-            "master.cli.calibrate_devices:extrinsics", "master.calibrate.extrinsics.command:extrinsics"),
+            "master.cli.calibrate_devices:extrinsics", "master.calibrate.extrinsics.extrinsics:extrinsics"),
     Command("calibrate object", "object", "where the beads of an object sit",
             "master.cli.calibrate_devices:object_options", "master.calibrate.object.command:object_command"),
     Command("calibrate cube", "object", "print a box of tags",

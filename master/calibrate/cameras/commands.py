@@ -277,7 +277,9 @@ def _seen(options: Namespace) -> BoardViews | Tracks:
 
 def _fit(seen: BoardViews | Tracks, held: Mapping[str, Float], options: Namespace) -> CamerasFit:
     bent = _bent(flat=options.flat_board, bent=options.bent_board)
-    return (fit_cameras if isinstance(seen, BoardViews) else fit_tracks)(seen, held, bent=bent)  # pyright: ignore[reportArgumentType]
+    if isinstance(seen, BoardViews):
+        return fit_cameras(seen, held, bent=bent)
+    return fit_tracks(seen, held, bent=bent)
 
 
 def _name_layout(found: Board, asked: Board) -> None:

@@ -5,6 +5,8 @@ From its length alone, from the guided routine, or from a motion capture.
 
 import sys
 from argparse import Namespace
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 
 from msgspec.structs import replace
@@ -26,7 +28,8 @@ from master.calibrate.hand.measure import (
 )
 from master.calibrate.hand.observed import read_observed
 from master.calibrate.hand.session import draw_hand, observe_live
-from master.calibrate.tree_files import load_marker_rig, print_lines, write_hand, write_report
+from master.calibrate.report import finish
+from master.calibrate.tree_files import load_marker_rig, print_lines, write_hand
 
 
 def hand_command(options: Namespace) -> None:
@@ -43,8 +46,7 @@ def hand_command(options: Namespace) -> None:
             read_motion(options.source, Reading(options.joints, options.unit, options.side, options.rate)),
             options.name,
         )
-        print_lines(motion_lines(made))
-        _finish(options.out, made.profile, motion_json(made), options.json_file)
+        _finish(options, motion_lines(made), made.profile, motion_json(made))
         return
     if options.joints is not None or options.unit is not None or options.rate is not None:
         raise CalibrationError("--joints, --unit and --rate are for --from FILE")
@@ -57,7 +59,7 @@ def hand_command(options: Namespace) -> None:
         if options.three_back:
             scaled = with_three_back_markers(scaled, options.name)
         profile = quick_profile(scaled, options.name, 1e-3 * options.length_mm)
-        echo(f"{side} hand scaled to {options.length_mm:g} mm; no bone is measured")
+        lines, draw = [f"{side} hand scaled to {options.length_mm:g} mm; no bone is measured"], None
     else:
         names = load_marker_rig(options.calibration, options.rig).markers
         model = HandModel.of(template)
@@ -70,20 +72,20 @@ def hand_command(options: Namespace) -> None:
         ratio = None if options.dip_per_pip is None else (options.dip_per_pip, ratio_sd)
         length_m = None if options.length_mm is None else 1e-3 * options.length_mm
         found = measure_hand(observed, template, length_m, ratio, _progress)
-        print_lines(report_lines(found))
+        lines, draw = report_lines(found), partial(draw_hand, measurement=found)
         data = "live" if options.poses is None else options.poses.name
         profile, report = measured_profile(found, options.name, data, options.dip_per_pip), report_json(found)
-        if options.picture is not None:
-            draw_hand(options.picture, found)
-    _finish(options.out, profile, report, options.json_file)
+    _finish(options, lines, profile, report, draw)
 
 
 def _finish(
-    out: Path | None, profile: HandProfile, report: dict[str, object], json_file: Path | None
+    options: Namespace,
+    lines: Iterable[str],
+    profile: HandProfile,
+    report: dict[str, object],
+    draw: Callable[[Path], None] | None = None,
 ) -> None:
-    written = None if out is None else write_hand(out, profile)
-    echo("nothing written: give --out DIR" if written is None else f"wrote {written}")
-    write_report(json_file, report, written)
+    finish(options, lines, report, draw, lambda out: {write_hand(out, profile): "the hand"})
 
 
 def _check_alone(options: Namespace) -> None:

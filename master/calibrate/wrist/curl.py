@@ -14,13 +14,13 @@ from msgspec.structs import replace
 from common.arrays import Bool, Float
 from common.calibration import RigCalibration
 from common.calibration.rig import FingerLine
-from common.command_line import echo
 from common.errors import FitError
 from common.geometry.transforms import intersect_plane
 from common.hand.model import FINGERS
 from common.hand.wrist import laser_plane_of
-from master.calibrate.tree_files import print_lines, provenance, refusals_named, write_report
-from master.calibrate.wrist.device import Device, device_of, write_device
+from master.calibrate.report import finish
+from master.calibrate.tree_files import provenance, refusals_named
+from master.calibrate.wrist.device import Device, device_of, writes_rig
 from master.estimator.priors import principal_line
 from master.replay.recorded import recorded_cycles
 
@@ -116,16 +116,16 @@ def curl(options: Namespace) -> None:
     laser_m = read_curled(options.detections, device)
     with refusals_named(options.recording):
         curls = fit_curls(laser_m)
-    print_lines(report_lines(curls))
-    if options.picture is not None:
+
+    def draw(path: Path) -> None:
         from master.calibrate.picture import draw_curls
 
-        draw_curls(options.picture, curls)
-        echo(f"drew {options.picture}")
+        draw_curls(path, curls)
+
     summary = ", ".join(found.finger for found in curls if found.line is not None)
-    written = write_device(options.out, device, rig_with_lines(device, curls), f"finger_lines of {summary}")
+    write = writes_rig(device, rig_with_lines(device, curls), f"finger_lines of {summary}")
     fingers = {found.finger: _json_of(found) for found in curls}
-    write_report(options.json_file, {"fingers": fingers}, written)
+    finish(options, report_lines(curls), {"fingers": fingers}, draw, write)
 
 
 def report_lines(curls: tuple[FingerCurl, ...]) -> list[str]:

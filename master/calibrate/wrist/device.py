@@ -16,7 +16,6 @@ import numpy as np
 
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, RigCalibration, load
-from common.command_line import echo
 from common.errors import CalibrationError, FitError, RecordingError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import cross, transform
@@ -24,6 +23,7 @@ from common.recording.frame_recording import MANIFEST, FrameRow, Illumination, o
 from master.calibrate.cameras.boards import Board, board_corners, find_board
 from master.calibrate.cameras.bundle import place_board
 from master.calibrate.cameras.views import ENDINGS, load_image
+from master.calibrate.report import Write
 from master.calibrate.tree_files import rig_in_tree, write_rig
 
 
@@ -75,18 +75,9 @@ def device_of(source: Path, rig_name: str | None, calibration: Path, out: Path |
     return Device(rig_in_tree(out, name, rig), name, camera, optics, source.resolve().name)
 
 
-def write_device(out: Path | None, device: Device, rig: RigCalibration, keys: str) -> Path | None:
-    """Write the rig file with what was measured, and print that; None: no tree given.
-
-    Raises:
-        CalibrationError: It cannot be written; the old file is untouched.
-    """
-    if out is None:
-        echo("nothing written: give --out DIR")
-        return None
-    written = write_rig(out, device.file_name, rig)
-    echo(f"wrote {written}: {keys}")
-    return written
+def writes_rig(device: Device, rig: RigCalibration, keys: str) -> Write:
+    """Writes the rig file of a device with what was measured under `keys`."""
+    return lambda out: {write_rig(out, device.file_name, rig): keys}
 
 
 _NAMED = re.compile(r"(.*?)[-_ .]?(ambient|laser|led|board)", re.IGNORECASE)
@@ -231,7 +222,7 @@ def board_corners_of(view: LitView, board: Board, optics: CameraModel) -> Float:
                 f" the camera {optics.width_px} x {optics.height_px}"
             )
         if lit is Illumination.LASER:
-            # A line is thinner than this; of a square's corner, which looks the same turned by 180 deg, the place stays.
+            # A line is thinner than this; a corner looks the same turned by 180 deg, so that its place stays.
             line_px = 7
             image = cast(Image, cv2.morphologyEx(image, cv2.MORPH_OPEN, np.ones((line_px, line_px))))
         if (observation := find_board(board, image)) is not None:

@@ -16,6 +16,7 @@ in the middle half to two.
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import cast
 
 import cv2
@@ -25,13 +26,13 @@ from msgspec.structs import replace
 from common.arrays import Float, Image, Int
 from common.calibration import RigCalibration
 from common.calibration.rig import FlatField, terms_of
-from common.command_line import echo
 from common.errors import FitError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import transform
 from common.recording.frame_recording import Illumination
 from master.calibrate.cameras.boards import Board, board_in, grid_shape
-from master.calibrate.tree_files import print_lines, provenance, refusals_named, write_report
+from master.calibrate.report import finish
+from master.calibrate.tree_files import provenance, refusals_named
 from master.calibrate.wrist.device import (
     BoardPose,
     Device,
@@ -40,7 +41,7 @@ from master.calibrate.wrist.device import (
     device_of,
     grouped_by_reason,
     lit_views,
-    write_device,
+    writes_rig,
 )
 
 _STEEPEST = np.cos(np.radians(60.0))  # paper is no Lambertian beyond
@@ -245,13 +246,6 @@ def flat_field(options: Namespace) -> None:
     seen = white_of(views, board_in(options), device.optics, leds)
     with refusals_named(options.source, grouped_by_reason(seen.refused)):
         fit = fit_flat_field(seen.samples, device.optics)
-    print_lines(report_lines(fit, seen, len(views), known_leds=bool(device.rig.led)))
-    if options.picture is not None:
-        from master.calibrate.picture import draw_flat_field
-
-        draw_flat_field(options.picture, fit, seen.samples, device.optics)
-        echo(f"drew {options.picture}")
-    written = write_device(options.out, device, rig_with_field(device, fit, seen), "flat_field")
     report: dict[str, object] = {
         "coefficients": list(fit.field.coefficients),
         "rms_percent": round(100 * fit.rms, 4),
@@ -260,7 +254,14 @@ def flat_field(options: Namespace) -> None:
         "views": seen.views,
         "refused": dict(seen.refused),
     }
-    write_report(options.json_file, report, written)
+
+    def draw(path: Path) -> None:
+        from master.calibrate.picture import draw_flat_field
+
+        draw_flat_field(path, fit, seen.samples, device.optics)
+
+    lines = report_lines(fit, seen, len(views), known_leds=bool(device.rig.led))
+    finish(options, lines, report, draw, writes_rig(device, rig_with_field(device, fit, seen), "flat_field"))
 
 
 def white_of(views: tuple[LitView, ...], board: Board, optics: CameraModel, led_m: Float) -> WhiteSeen:

@@ -10,7 +10,6 @@ the paper, not the light, makes the slope.
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import map_coordinates

@@ -11,6 +11,7 @@ from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 from msgspec.structs import replace
@@ -25,7 +26,8 @@ from common.geometry.transforms import cross
 from common.recording.frame_recording import Illumination
 from master.calibrate.adjust import Normal, minimise
 from master.calibrate.cameras.boards import Board, board_in
-from master.calibrate.tree_files import print_lines, provenance, refusals_named, write_report
+from master.calibrate.report import finish
+from master.calibrate.tree_files import provenance, refusals_named
 from master.calibrate.wrist.device import (
     BoardPose,
     Device,
@@ -35,7 +37,7 @@ from master.calibrate.wrist.device import (
     grouped_by_reason,
     lit_views,
     place_corners,
-    write_device,
+    writes_rig,
 )
 from master.calibrate.wrist.laser_line import BoardLine, line_on_board
 
@@ -303,7 +305,8 @@ class LinesSeen:
 def laser_plane(options: Namespace) -> None:
     """Measure the plane of a wrist device's laser, from views of a board or a cloud."""
     if options.source.is_file():
-        return _of_cloud(options)
+        _of_cloud(options)
+        return
     if options.board is None or options.square_mm is None:
         raise UsageError("of pictures: give --board COLUMNSxROWS and --square-mm MM")
     if options.unit is not None:
@@ -313,16 +316,15 @@ def laser_plane(options: Namespace) -> None:
     seen = lines_of(views, board_in(options), device.optics)
     with refusals_named(options.source, grouped_by_reason(seen.refused)):
         fit = fit_plane(seen.lines)
-    print_lines(report_lines(fit, seen, len(views)))
-    if options.picture is not None:
+    note = f"{int(fit.used.sum())} of {len(fit.used)} views of a board"
+
+    def draw(path: Path) -> None:
         from master.calibrate.picture import draw_plane
 
-        draw_plane(options.picture, fit, seen.lines, device.optics)
-        echo(f"drew {options.picture}")
-    note = f"{int(fit.used.sum())} of {len(fit.used)} views of a board"
-    written = write_device(options.out, device, rig_with_plane(device, fit, note), "laser_plane")
-    write_report(options.json_file, report_json(fit, seen), written)
-    return None
+        draw_plane(path, fit, seen.lines, device.optics)
+
+    write = writes_rig(device, rig_with_plane(device, fit, note), "laser_plane")
+    finish(options, report_lines(fit, seen, len(views)), report_json(fit, seen), draw, write)
 
 
 def _of_cloud(options: Namespace) -> None:
@@ -333,22 +335,23 @@ def _of_cloud(options: Namespace) -> None:
     with refusals_named(options.source):
         found = fit_cloud(points)
     fit, used = found.fit, found.used
-    print_lines([f"laser plane from {used}, {1e3 * fit.rms_m:.3f} mm rms from it", *_plane_lines(fit)])
+    lines = [f"laser plane from {used}, {1e3 * fit.rms_m:.3f} mm rms from it", *_plane_lines(fit)]
     if found.over_all is not None:
-        print_lines(["over all points, outliers included (not written):", *_plane_lines(found.over_all)])
+        lines += ["over all points, outliers included (not written):", *_plane_lines(found.over_all)]
     if fit.normal_sigma_rad > NORMAL_LIMIT_RAD or fit.offset_sigma_m > _OFFSET_LIMIT_M:
-        echo(
+        lines.append(
             f"less certain than a board's views have to be ({np.degrees(NORMAL_LIMIT_RAD):.1f} deg,"
             f" {1e3 * _OFFSET_LIMIT_M:.1f} mm)"
         )
-    if options.picture is not None:
+
+    def draw(path: Path) -> None:
         from master.calibrate.picture import draw_cloud
 
-        draw_cloud(options.picture, fit, points, np.repeat(fit.used, [len(p) for p in found.lines.points_m]))
-        echo(f"drew {options.picture}")
-    written = write_device(options.out, device, rig_with_plane(device, fit, used), "laser_plane")
+        draw_cloud(path, fit, points, np.repeat(fit.used, [len(p) for p in found.lines.points_m]))
+
     over = {} if found.over_all is None else {"over_all": plane_json(found.over_all)}
-    write_report(options.json_file, plane_json(fit) | {"points": len(points)} | over, written)
+    write = writes_rig(device, rig_with_plane(device, fit, used), "laser_plane")
+    finish(options, lines, plane_json(fit) | {"points": len(points)} | over, draw, write)
 
 
 def lines_of(views: tuple[LitView, ...], board: Board, optics: CameraModel) -> LinesSeen:

@@ -27,7 +27,8 @@ from common.geometry.transforms import invert, matrix_to_rotation_vector, rigid,
 from common.hand.model import HandModel
 from common.recording.frame_recording import Illumination
 from master.calibrate.cameras.boards import Board, board_in, grid_shape
-from master.calibrate.tree_files import matrix_of, print_lines, provenance, refusals_named, write_report
+from master.calibrate.report import finish
+from master.calibrate.tree_files import matrix_of, print_lines, provenance, refusals_named
 from master.calibrate.wrist.device import (
     BoardPose,
     Device,
@@ -35,7 +36,7 @@ from master.calibrate.wrist.device import (
     device_of,
     grouped_by_reason,
     lit_views,
-    write_device,
+    writes_rig,
 )
 
 _FLAT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # board axes -> palm axes
@@ -146,15 +147,14 @@ def palm(options: Namespace) -> None:
     )
     with refusals_named(options.source):
         fit = _by_board(options.source, board_in(options), offset, device)
-    print_lines(report_lines(fit))
-    written = write_device(options.out, device, rig_with_palm(device, fit), "T_camera_palm")
     report: dict[str, object] = {
         "T_camera_palm": fit.T_camera_palm.tolist(),
         "rotation_sigma_deg": float(np.degrees(fit.rotation_sigma_rad)),
         "shift_sigma_mm": 1e3 * fit.shift_sigma_m,
         "residual": fit.residual,
     }
-    write_report(options.json_file, report, written)
+    write = writes_rig(device, rig_with_palm(device, fit), "T_camera_palm")
+    finish(options, report_lines(fit), report, None, write)
 
 
 def _by_board(source: Path, board: Board, offset: BoardOffset, device: Device) -> PalmFit:

@@ -17,12 +17,12 @@ from msgspec.structs import replace
 
 from common.arrays import Bool, Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.command_line import echo
 from common.errors import CalibrationError, FitError
 from common.hand.model import CHAINS, FINGERS, HandModel
 from common.messages import WristDetections
-from master.calibrate.tree_files import matrix_of, print_lines, provenance, refusals_named, write_hand
-from master.calibrate.wrist.device import Device, device_of, write_device
+from master.calibrate.report import finish
+from master.calibrate.tree_files import matrix_of, provenance, refusals_named, write_hand, write_rig
+from master.calibrate.wrist.device import device_of
 from master.calibrate.wrist.subject_fit import (
     FLAT,
     MOTION,
@@ -34,7 +34,6 @@ from master.calibrate.wrist.subject_fit import (
     prior_sigma,
 )
 from master.calibrate.wrist.subject_model import MCP, SubjectModel, Unknown, fitted_profile
-from master.commands.summary import write_summary
 from master.replay.recorded import recorded_cycles
 from master.rig.wrist import WristSetup
 
@@ -247,16 +246,19 @@ def subject(options: Namespace) -> None:
     cycles = list(recorded_cycles(options.detections, device.camera.name))
     with refusals_named(options.recording):
         found = calibrate_subject(cycles, device.rig, device.camera, profile, device.source)
-    print_lines(found.report)
-    if options.picture is not None:
+    hand = replace(found.hand, name=options.name or profile.name)
+
+    def draw(path: Path) -> None:
         from master.calibrate.picture import draw_subject
 
-        draw_subject(options.picture, found, device.optics)
-        echo(f"drew {options.picture}")
-    new = replace(found.hand, name=options.name or profile.name)
-    written = _write(options.out, device, found, new)
-    if options.json_file is not None:
-        write_summary(options.json_file, summary(found) | {"written": written})
+        draw_subject(path, found, device.optics)
+
+    def write(out: Path) -> dict[Path, str]:
+        rig = write_rig(out, device.file_name, replace(found.rig, hand=hand.name))
+        own = "knuckles, lengths and palmar_scale of index ... little"
+        return {rig: "T_camera_palm, hand", write_hand(out, hand): own}
+
+    finish(options, found.report, summary(found), draw, write)
 
 
 def _hand_of(name: str, calibration: Path, out: Path | None) -> Path:
@@ -264,16 +266,6 @@ def _hand_of(name: str, calibration: Path, out: Path | None) -> Path:
     trees = [calibration] if out is None else [out, calibration]
     paths = [tree / "hands" / f"{name}.json" for tree in trees]
     return next((path for path in paths if path.exists()), paths[-1])
-
-
-def _write(out: Path | None, device: Device, found: Subject, hand: HandProfile) -> list[str]:
-    """Write hand and rig, which names the hand; their paths, none without a tree."""
-    rig = write_device(out, device, replace(found.rig, hand=hand.name), "T_camera_palm, hand")
-    if out is None or rig is None:
-        return []
-    path = write_hand(out, hand)
-    echo(f"wrote {path}: knuckles, lengths and palmar_scale of index ... little")
-    return [str(rig), str(path)]
 
 
 def summary(found: Subject) -> dict[str, object]:
