@@ -233,7 +233,7 @@ def _begin(state: HandState) -> None:
 def _take_measured(
     hand: Any, settings: Settings, state: HandState, task: Task, ground: Ground, scan: Any, t_ns: int
 ) -> None:
-    """Note when each part was measured, by which level and how surely."""
+    """Follow when, by which level and how surely each part was measured."""
     if task.palm_shown[0] > 0:
         state.measured_ns[PALM_PART] = t_ns
     for f in range(5):

@@ -247,9 +247,9 @@ def _cap_spread(
     points: Float,
     cov: Float,
 ) -> None:
-    """Write point and covariance of marker m by its finger's radius and direction.
+    """Write point and covariance of marker m by radius and direction.
 
-    `ahead` (3,) is the direction, `tilt` (3, 3) [rad^2] its covariance.
+    `ahead` (3,) is that of its finger, rig frame, `tilt` (3, 3) [rad^2] its covariance.
     """
     point, off, aim, by, bias = work.point, work.off, work.aim, work.by, work.bias
     for k in range(3):
@@ -287,7 +287,7 @@ def _add_noise(
     cov: Float,
     noise: Float,
 ) -> None:
-    """Add the errors of centroids [px^2] and law, by the derivatives of the point."""
+    """Add noise of centroids, by variances [px^2], and of the law."""
     ray, by = work.ray, work.by
     per_px, scale = metres_per_pixel(tables, z), z / tables.focal_px[0]
     for k in range(3):  # derivatives by u of the left camera, v of it, and u of the right one

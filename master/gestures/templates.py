@@ -24,7 +24,7 @@ from common.errors import FitError
 from common.hand.model import FINGERS, HandModel
 from common.messages import HandPose
 from master.gestures.features import FeatureExtractor, HandFeatures
-from master.gestures.quantities import QUANTITIES, FingerSpeed, PoseTable, Quantities, known_bends
+from master.gestures.poses import QUANTITIES, FingerSpeed, PoseTable, Quantities, known_bends
 
 FEWEST = 3  # examples
 SHORTEST = 5  # frames of one

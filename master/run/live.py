@@ -148,7 +148,7 @@ def _open_bus(
     clock: Clock,
     notify: Callable[[str], None],
 ) -> tuple[ZenohBus, Probe]:
-    """Open the bus, the probe of subscribers, and the recorder's process if wanted."""
+    """Open the bus, the probe of what is taken, and a recorder if wanted."""
     bus = host_bus(settings.bus, devices_of(setups))
     stack.callback(bus.close)
     probe = Probe(bus, clock, always=settings.record is not None)

@@ -8,7 +8,7 @@ from common.geometry.transforms import rigid, transform
 from common.hand.model import WRIST, HandModel
 from common.messages import HandPose
 from master.gestures.features import KNOWN_SIGMA_M, FeatureExtractor, HandFeatures
-from master.gestures.quantities import QUANTITIES, Quantities
+from master.gestures.poses import QUANTITIES, Quantities
 from tests.hand_helpers import LEFT, RIGHT, any_rotation, palm
 from tests.master.gestures.shown_hands import PINCH, POINT, posture, shown
 

@@ -23,7 +23,7 @@ from master.calibrate.cameras.capture import StillTaker, capture, new_folder
 from master.calibrate.cameras.coverage import LiveViews
 from master.console.link import PictureSizes
 from master.console.state import ConsoleSettings, ConsoleState
-from master.outputs.rerun_sensors import CameraImages
+from master.outputs.rerun_scene import CameraImages
 from master.run.ingest import Ingest
 from tests.network_helpers import free_endpoint, until
 from tests.picture_helpers import TINY, claiming, hostile
