@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import map_coordinates  # pyright: ignore[reportUnknownVariableType]
 
 from common.arrays import Bool, Float, Image, Int
 from common.errors import FitError
@@ -148,7 +148,7 @@ def _level_plane(terms: Float, values: Float) -> tuple[Float, float]:
         off = np.abs(values - terms @ found)
         limit = 1.4826 * float(np.median(off)) + 0.3
         own = off < 3.0 * limit
-        found = np.linalg.lstsq(terms[own], values[own], rcond=None)[0]
+        found = np.asarray(np.linalg.lstsq(terms[own], values[own], rcond=None)[0], np.float64)
     return found, limit
 
 

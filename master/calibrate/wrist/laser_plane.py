@@ -382,7 +382,7 @@ def _line_of(view: LitView, board: Board, optics: CameraModel) -> tuple[BoardPos
     corners = board_corners_of(view, board, optics)
     placed = place_corners(corners, board, optics)
     line = line_on_board(laser, ambient, placed, board, optics)
-    if view.frames.keys() != {Illumination.LASER}:
+    if set(view.frames) != {Illumination.LASER}:
         return placed, line
     # Corners near the line of the same picture are drawn towards it.
     way = line.uv[-1] - line.uv[0]

@@ -12,7 +12,7 @@ from common.geometry.transforms import quaternion_to_matrix
 from common.imu.csv_table import write_imu
 from common.messages import HandPose
 from common.recording.frame_recording import COLUMNS, FRAMES, MANIFEST, Manifest
-from master.calibrate.extrinsics import command, extrinsics, problem
+from master.calibrate.extrinsics import extrinsics, problem
 from master.calibrate.extrinsics.extrinsics import calibrate_extrinsics, refuse
 from master.calibrate.extrinsics.unknown import UNKNOWN, Fit
 from master.rig.setup import RigSetup
@@ -73,8 +73,8 @@ def test_the_command_writes_the_true_extrinsics_into_a_tree(
         return found[0]
 
     # The line of the markers has tests of its own; without noise fewer steps are enough.
-    monkeypatch.setattr(command, "marker_poses", as_seen)
-    monkeypatch.setattr(command, "calibrate_extrinsics", noted)
+    monkeypatch.setattr(extrinsics, "marker_poses", as_seen)
+    monkeypatch.setattr(extrinsics, "calibrate_extrinsics", noted)
     monkeypatch.setattr(problem, "_COARSE_ROUNDS", (3,))
     monkeypatch.setattr(problem, "_ROUNDS", (4, 3))
     folder, tree, picture = recorded(seen, tmp_path), tmp_path / "tree", tmp_path / "extrinsics.png"

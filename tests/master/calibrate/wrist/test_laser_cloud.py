@@ -172,7 +172,7 @@ def test_the_command_writes_the_plane_and_where_it_is_from(tmp_path: Path) -> No
 
 
 def test_the_published_plane_of_a_real_scanner(datasets: Path, tmp_path: Path) -> None:
-    """23 lines of a Ciclop scanner (Jesus89/3DScanScience, CC BY-SA 4.0); figures of its notebook 4.4."""
+    """18 lines of a Ciclop scanner (Jesus89/3DScanScience, CC BY-SA 4.0); figures of its notebook 4.4."""
     path = datasets / "line_laser" / "laser-pc.ply"
     if not path.is_file():
         pytest.skip(f"no {path}: the file notebooks/laser-pc.ply of github.com/Jesus89/3DScanScience")
