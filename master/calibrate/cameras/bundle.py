@@ -171,10 +171,14 @@ def predict(bundle: Bundle, seen: Observation) -> Float:
     """Pixels (n, 2) where the corners of an observation should be, as of its time."""
     on_board = bundle.drawn_m[seen.corners] + bundle.shape_m[seen.corners]
     points = transform(bundle.T_camera_rig[seen.camera] @ bundle.T_rig_board[seen.view], on_board)
-    lens = bundle.lenses[seen.camera]
-    uv, _ = cv2.projectPoints(points, _ZERO, _ZERO, _matrix(lens), lens[4:])
-    found = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
+    found = project(points, bundle.lenses[seen.camera])
     return found if seen.speed is None else found - seen.speed * bundle.delay_s[seen.camera]
+
+
+def project(points_m: Float, lens: Float) -> Float:
+    """Pixels (n, 2) of points (n, 3) [m] before a lens (9,)."""
+    uv, _ = cv2.projectPoints(points_m, _ZERO, _ZERO, _matrix(lens), lens[4:])
+    return np.asarray(uv, dtype=np.float64).reshape(-1, 2)
 
 
 def rms(residuals: Sequence[Float]) -> float:

@@ -6,6 +6,7 @@ with the board as drawn and with a shape of its own -> the one that predicts hel
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import permutations
 from typing import cast
 
 import numpy as np
@@ -14,7 +15,7 @@ from common.arrays import Bool, Float, Int
 from common.errors import FitError
 from common.geometry.transforms import fit_rigid, invert, transform
 from master.calibrate.cameras.boards import Board, board_corners, orderings
-from master.calibrate.cameras.bundle import Bundle, Free, Observation, Solution, predict, rms, solve
+from master.calibrate.cameras.bundle import Bundle, Free, Observation, Solution, predict, project, rms, solve
 from master.calibrate.cameras.outliers import (
     MIN_SHAPE_VIEWS,
     MIN_VIEWS,
@@ -26,6 +27,7 @@ from master.calibrate.cameras.outliers import (
     Shot,
     centre_of,
     choose,
+    corners_seen,
     fit_alone,
     judge,
     place_boards,
@@ -177,6 +179,8 @@ def fit_cameras(
     held = held or {}
     alone = {camera: fit_alone(views, camera, held.get(camera)) for camera in views.cameras}
     links = link(views.board, views.cameras, {camera: fit.T_camera_board for camera, fit in alone.items()})
+    if all(seen.speed_px_s is None for view in views.views for seen in view.observations.values()):
+        _refuse_moved(views, alone, links)  # of frames with times, those of a moving board have a lag as well
     seen = Seen(views, links.corner_order)
     drawn = board_corners(views.board)
     start = Bundle(
@@ -231,6 +235,54 @@ def fit_tracks(
         fit,
         delay_s={name: delay_s[name] + float(step) for name, step in zip(tracks.cameras, steps, strict=True)},
     )
+
+
+def _refuse_moved(views: BoardViews, alone: Mapping[str, Alone], links: Links) -> None:
+    """Refuse views before and after a camera was moved.
+
+    Where one camera has the board, by itself, another should see it. It sees it off there by much the same before a
+    move, and after it by another offset, farther off than the views of one time scatter.
+
+    Raises:
+        FitError: Names the camera, or both where there are two, and the views between which it moved.
+    """
+    drawn, jumps = board_corners(views.board), dict[tuple[str, str], tuple[float, str, str]]()
+    for a, b in permutations(views.cameras, 2):
+        shared = [
+            v for v in views.views if v.name in alone[a].T_camera_board and v.name in alone[b].T_camera_board
+        ]
+        off = np.zeros((len(shared), 2))  # [px]
+        T = links.T_camera_rig[b] @ invert(links.T_camera_rig[a])
+        for k, view in enumerate(shared):
+            order, points = links.corner_order[view.name], np.empty_like(drawn)
+            points[order[a]] = transform(T @ alone[a].T_camera_board[view.name], drawn)
+            corners, uv = corners_seen(view.observations[b])
+            off[k] = (uv - project(points[order[b][corners]], alone[b].lens)).mean(axis=0)
+        size, k = _jump(off)
+        if size > 0.0:
+            jumps[a, b] = size, shared[k - 1].name, shared[k].name
+    if not jumps:
+        return
+    in_jumps = {name: sum(name in pair for pair in jumps) for name in views.cameras}
+    moved = " or ".join(repr(name) for name, count in in_jumps.items() if count == max(in_jumps.values()))
+    size, before, after = max(jumps.values())
+    raise FitError(
+        f"camera {moved} moved between the views {before} and {after}: corners jump by {size:.1f} px there; take the"
+        " views before or after it alone, and fasten the cameras"
+    )
+
+
+def _jump(off: Float) -> tuple[float, int]:
+    """The jump [px] of offsets (V, 2), and the view after it; 0: they scatter only."""
+    least, sure, least_px = 3, 6.0, 1.0  # views of either place; standard deviations
+    best, found = np.inf, (0.0, 0)
+    for k in range(least, len(off) - least + 1):
+        middles = [np.median(part, axis=0) for part in (off[:k], off[k:])]
+        rest = np.linalg.norm(np.concatenate([off[:k] - middles[0], off[k:] - middles[1]]), axis=1)
+        if rest.sum() < best:
+            size, scatter = float(np.linalg.norm(middles[1] - middles[0])), 1.4826 * float(np.median(rest))
+            best, found = float(rest.sum()), (size if size > max(sure * scatter, least_px) else 0.0, k)
+    return found
 
 
 def _model(fit: CamerasFit) -> Model:

@@ -121,6 +121,8 @@ class Finder:
 
     def advice(self) -> str:
         """What to do about a board that was found in no image."""
+        if any(find_board(self.board, np.ascontiguousarray(image[:, ::-1])) for image in self._without):
+            return "the pictures are mirrored, as a webcam shows them to its user: turn that off"
         likely = list(_likely_mistakes(self.board))
         likely += [other for board in likely if isinstance(board, Charuco) for other in board.layouts()]
         for other in likely:

@@ -78,6 +78,8 @@ def test_the_board_that_is_there_is_named_when_another_was_asked_for() -> None:
     charuco = render(scene(26, 1, views=1, board=CHARUCO), 0, "left", seed=26)
     with pytest.raises(FitError, match=r"they show a ChArUco board of 7 x 5 .* 4X4"):
         _look(Charuco(7, 5, 0.035, 0.026, "6X6_250"), charuco)
+    with pytest.raises(FitError, match="the pictures are mirrored"):
+        _look(CHARUCO, np.ascontiguousarray(charuco[:, ::-1]))
     with pytest.raises(FitError, match="there is no image"):
         look(CHECKER, [])
 

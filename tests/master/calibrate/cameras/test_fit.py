@@ -9,7 +9,7 @@ import pytest
 
 from common.arrays import Float
 from common.errors import FitError
-from common.geometry.transforms import invert
+from common.geometry.transforms import axis_rotation, invert, rigid
 from master.calibrate.cameras.boards import Charuco, Checkerboard, ImageObservation, board_corners, orderings
 from master.calibrate.cameras.fit import CamerasFit, fit_cameras
 from master.calibrate.cameras.result import report_lines, result
@@ -296,3 +296,16 @@ def test_few_views_take_the_board_as_drawn_and_say_so() -> None:
     assert "7 views are too few to determine its shape, at least 8" in fit.board.reason
     with pytest.raises(FitError, match="7 good views are too few for the board's own shape"):
         fit_cameras(views, bent=True)
+
+
+@pytest.mark.parametrize(("cameras", "named"), [(2, "'left' or 'right'"), (3, "'right'")])
+@pytest.mark.parametrize(("turn_deg", "shift_mm"), [(0.5, 0.0), (0.0, 5.0)])
+def test_a_camera_that_moved_between_the_views_is_named(
+    cameras: int, named: str, turn_deg: float, shift_mm: float
+) -> None:
+    still, moves = scene(3, cameras), 9
+    move = rigid(axis_rotation(1, np.radians(turn_deg)), np.array([1e-3 * shift_mm, 0.0, 0.0]))
+    T = still.T_camera_rig["right"]
+    after = {(v, "right"): invert(T) @ move @ T @ still.T_rig_board[v] for v in range(moves, 18)}
+    with pytest.raises(FitError, match=f"camera {named} moved between the views 08 and 09"):
+        fit_cameras(replace(still, moved=after).views(0.1, 3))
