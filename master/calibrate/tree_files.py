@@ -35,7 +35,8 @@ def provenance(tool: str, data: tuple[str, ...], residual: dict[str, float], not
 
     `data` are names of what it was measured from, `residual` a quantity with its unit -> value.
     """
-    return Provenance(date=date_now(), tool=tool, data=data, residual=residual, note=note)
+    rounded = {quantity: round(value, 6) for quantity, value in residual.items()}
+    return Provenance(date=date_now(), tool=tool, data=data, residual=rounded, note=note)
 
 
 def load_marker_rig(calibration: Path, name: str) -> RigCalibration:

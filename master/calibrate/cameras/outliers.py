@@ -111,9 +111,11 @@ def fit_alone(views: BoardViews, camera: str, held: Float | None = None) -> Alon
     drawn = board_corners(views.board)
     observations = views.of(camera)
     if held is None and len(observations) < MIN_VIEWS:
+        without = " ".join(f"--camera {name}" for name in views.cameras if name != camera)
         raise FitError(
             f"camera {camera!r}: the board is seen in {len(observations)} images, at least {MIN_VIEWS} are needed"
             " (better 15), each with the board in another place and tilt"
+            + (f"; or leave it out: {without}" if without else "")
         )
     names = [name for name, _ in observations]
     seen = [corners_seen(observation) for _, observation in observations]

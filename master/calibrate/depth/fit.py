@@ -254,14 +254,14 @@ def report_lines(report: DepthReport) -> list[str]:
 
 
 def residual_of(report: DepthReport, name: str) -> dict[str, float]:
-    """Residuals and standard deviations of a fitted law, for its provenance."""
+    """Residuals and standard deviations of a fitted law."""
     mean, largest = report.mean_max(name)
     numbers = ("k_sd_m", "z_sd") if name == "power_law" else ("a_sd_m_px", "x0_sd_px")
     return {
-        "mean_percent": round(100.0 * mean, 4),
-        "max_percent": round(100.0 * largest, 4),
-        "leave_one_out_mean_percent": round(100.0 * float(np.abs(report.rejected[name]).mean()), 4),
-        **{number: round(float(sd), 6) for number, sd in zip(numbers, report.sd[name], strict=True)},
+        "mean_percent": 100.0 * mean,
+        "max_percent": 100.0 * largest,
+        "leave_one_out_mean_percent": 100.0 * float(np.abs(report.rejected[name]).mean()),
+        **{number: float(sd) for number, sd in zip(numbers, report.sd[name], strict=True)},
     }
 
 
