@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bench.hands.draws import without_tolerance
 from common.arrays import Float
 from common.calibration import (
     CameraCalibration,
@@ -20,7 +21,7 @@ from common.calibration import (
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import rigid
 from common.hand.model import CHAINS, HandJoints, HandModel
-from common.hand.profiles import generated_profile, preset_limits, without_tolerance
+from common.hand.profiles import generated_profile, preset_limits
 from common.messages import MarkerDetections
 from master.fabrik.caps import CapTables, seen_shift
 

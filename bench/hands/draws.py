@@ -19,11 +19,11 @@ import numpy as np
 from scipy.optimize import least_squares  # pyright: ignore[reportUnknownVariableType]
 
 from common.arrays import Float
-from common.calibration import Couplings, HandProfile
+from common.calibration import Couplings, HandProfile, Limits
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import rigid, rotation_vector_to_matrix
 from common.hand.model import HandModel
-from common.hand.profiles import ABDUCTION, FLEXION, generated_profile, preset_limits, without_tolerance
+from common.hand.profiles import ABDUCTION, FLEXION, generated_profile, preset_limits
 from master.estimator.epoch import Epoch, Fitted, OrientationMeasurement
 from master.estimator.estimator import Estimator
 from master.estimator.settings import DEFAULT, Settings
@@ -67,6 +67,15 @@ class Draw:
         return Draw(
             self.T_rig_palm[::step], self.angles_rad[::step], self.joints_m[::step], self.caps_m[::step]
         )
+
+
+def without_tolerance(limits: Limits) -> Limits:
+    """The same limits as walls."""
+    walls = {
+        name: msgspec.structs.replace(getattr(limits, name), tolerance_rad=(0.0, 0.0, 0.0, 0.0))
+        for name in Limits.__struct_fields__
+    }
+    return Limits(**walls)
 
 
 def bench_model(*, coupled: bool = True) -> HandModel:

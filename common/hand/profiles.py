@@ -285,15 +285,6 @@ def preset_limits(preset: Preset) -> Limits:
     return Limits(thumb=thumb, index=side, middle=finger(0.0 if k else abduction), ring=side, little=side)
 
 
-def without_tolerance(limits: Limits) -> Limits:
-    """The same limits as walls."""
-    walls = {
-        name: replace(getattr(limits, name), tolerance_rad=(0.0, 0.0, 0.0, 0.0))
-        for name in Limits.__struct_fields__
-    }
-    return Limits(**walls)
-
-
 def preset_couplings(preset: Preset) -> Couplings:
     """DIP per PIP: 2/3 (K), 0.84 (D, Kamper's ratio); MCP = 0.54 PIP: natural (D)."""
     return Couplings(dip_per_pip=2.0 / 3.0 if preset == "K" else 0.84, mcp_per_pip=0.54)

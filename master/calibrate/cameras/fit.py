@@ -242,9 +242,6 @@ def _refuse_moved(views: BoardViews, alone: Mapping[str, Alone], links: Links) -
 
     Where one camera has the board, by itself, another should see it. It sees it off there by much the same before a
     move, and after it by another offset, farther off than the views of one time scatter.
-
-    Raises:
-        FitError: Names the camera, or both where there are two, and the views between which it moved.
     """
     drawn, jumps = board_corners(views.board), dict[tuple[str, str], tuple[float, str, str]]()
     for a, b in permutations(views.cameras, 2):
@@ -258,9 +255,8 @@ def _refuse_moved(views: BoardViews, alone: Mapping[str, Alone], links: Links) -
             points[order[a]] = transform(T @ alone[a].T_camera_board[view.name], drawn)
             corners, uv = corners_seen(view.observations[b])
             off[k] = (uv - project(points[order[b][corners]], alone[b].lens)).mean(axis=0)
-        size, k = _jump(off)
-        if size > 0.0:
-            jumps[a, b] = size, shared[k - 1].name, shared[k].name
+        if (jump := _jump(off))[0] > 0.0:
+            jumps[a, b] = jump[0], shared[jump[1] - 1].name, shared[jump[1]].name
     if not jumps:
         return
     in_jumps = {name: sum(name in pair for pair in jumps) for name in views.cameras}
