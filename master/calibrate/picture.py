@@ -9,9 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from common.arrays import Bool, Float
 from common.calibration.files import replacing
@@ -20,6 +17,9 @@ from common.errors import RecordingError
 from common.geometry.camera_model import CameraModel
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
     from master.calibrate.extrinsics.extrinsics import Extrinsics
     from master.calibrate.wrist.curl import FingerCurl
     from master.calibrate.wrist.flat_field import FlatFit, WhiteSamples
@@ -27,14 +27,20 @@ if TYPE_CHECKING:
     from master.calibrate.wrist.subject import Subject
 
 
-def figure_of(size: tuple[float, float]) -> Figure:
-    """An empty figure of a size [inches]."""
+def figure_of(size: tuple[float, float]) -> "Figure":
+    """An empty figure of a size [inches].
+
+    It loads matplotlib, which nothing but a picture needs.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=size, dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
-def save_figure(figure: Figure, path: Path) -> None:
+def save_figure(figure: "Figure", path: Path) -> None:
     """Write a figure as PNG.
 
     Raises:
@@ -141,7 +147,7 @@ def draw_curls(path: Path, curls: "Sequence[FingerCurl]") -> None:
     save_figure(figure, path)
 
 
-def framed(axes: Axes, optics: CameraModel, title: str) -> None:
+def framed(axes: "Axes", optics: CameraModel, title: str) -> None:
     """Give axes the frame of the camera's image."""
     axes.set(xlim=(0, optics.width_px), ylim=(optics.height_px, 0), aspect="equal", title=title)
 
@@ -170,7 +176,7 @@ def draw_subject(path: Path, found: "Subject", optics: CameraModel) -> None:
 
 
 def draw_over_time(
-    axes: Axes,
+    axes: "Axes",
     t_s: Float,
     values: Float,
     outlier: Bool,

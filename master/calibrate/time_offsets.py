@@ -19,6 +19,7 @@ from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections
 from master.calibrate.observations import recorded_motion
+from master.calibrate.picture import BLUE, GREY, figure_of, save_figure
 from master.calibrate.report import Column, Table, finish
 from master.calibrate.tree_files import provenance, rig_in_tree, write_into_rig
 from master.monitor.clocks import ResidualTiming
@@ -173,8 +174,6 @@ def report_json(rig: RigCalibration, times: Sequence[CameraTime]) -> dict[str, o
 
 def draw_times(path: Path, rig: RigCalibration, times: Sequence[CameraTime]) -> None:
     """Draw each camera's offset with its three standard deviations."""
-    from master.calibrate.picture import BLUE, GREY, figure_of, save_figure  # matplotlib, for a picture alone
-
     figure = figure_of((8.0, 1.6 + 0.5 * len(times)))
     axes = figure.subplots()
     for row, time in enumerate(times):

@@ -20,6 +20,7 @@ from master.calibrate.cameras.fit import CamerasFit
 from master.calibrate.cameras.outliers import corners_seen
 from master.calibrate.cameras.tracks import is_new
 from master.calibrate.cameras.views import BoardViews, Finder, View, moved_px
+from master.calibrate.picture import figure_of, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -190,8 +191,6 @@ def draw_views(path: Path, fit: CamerasFit) -> None:
         RecordingError: The file cannot be written.
     """
     cameras = fit.views.cameras
-    from master.calibrate.picture import figure_of, save_figure  # matplotlib, for a picture alone
-
     figure = figure_of((15.0, 0.6 + 3.7 * len(cameras)))
     figure.suptitle(f"{fit.views.board}: {len(fit.shots)} images, rms {fit.rms_px:.3f} px")
     axes = figure.subplots(len(cameras), 3, squeeze=False, width_ratios=(1.0, 1.0, 1.1))

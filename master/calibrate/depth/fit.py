@@ -43,6 +43,7 @@ from master.calibrate.depth.sweep import (
     check_enough,
     checked,
 )
+from master.calibrate.picture import figure_of, save_figure
 from master.calibrate.report import Column, Table, finish
 from master.calibrate.tree_files import provenance, refusals_named, rig_in_tree, write_into_rig
 from master.fabrik.depth import AffineDisparity, DepthLaw, PowerLaw, ideal_law
@@ -319,8 +320,6 @@ def draw_errors(
     Raises:
         RecordingError: The file cannot be written.
     """
-    from master.calibrate.picture import figure_of, save_figure  # matplotlib, for a picture alone
-
     figure = figure_of((9.0, 7.5))
     figure.suptitle(title)
     largest = {name: 100.0 * float(np.nanmax(np.abs(error))) for name, error in errors.items()}

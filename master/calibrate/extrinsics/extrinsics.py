@@ -8,6 +8,7 @@ from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import dataclass
 from dataclasses import replace as replaced
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,7 @@ from master.calibrate.extrinsics.unknown import (
     started,
 )
 from master.calibrate.observations import detections_of
+from master.calibrate.picture import draw_extrinsics
 from master.calibrate.report import finish
 from master.calibrate.tree_files import matrix_of, provenance, refusals_named
 from master.calibrate.wrist.device import device_of, writes_rig
@@ -343,13 +345,8 @@ def extrinsics(options: Namespace) -> None:
         found = calibrate_extrinsics(
             poses, setup.markers, setup.hand, cycles, samples, device.rig, device.camera, device.source
         )
-
-    def draw(path: Path) -> None:
-        from master.calibrate.picture import draw_extrinsics
-
-        draw_extrinsics(path, found, device.optics)
-
     write = writes_rig(device, found.rig, "T_camera_palm, imu, stamp_offset_us")
+    draw = partial(draw_extrinsics, found=found, optics=device.optics)
     finish(options, found.report, summary(found), draw, write)
 
 

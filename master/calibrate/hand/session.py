@@ -19,6 +19,7 @@ from common.messages import HandPose
 from master.calibrate.hand.measure import CERTAIN, WITHIN_M, HandMeasurement
 from master.calibrate.hand.observed import Observed, marker_rows
 from master.calibrate.observations import check_markers
+from master.calibrate.picture import figure_of, save_figure
 from master.calibrate.session import Session, listening
 
 if TYPE_CHECKING:
@@ -126,8 +127,6 @@ def draw_hand(path: Path, measurement: HandMeasurement) -> None:
     Raises:
         RecordingError: The file cannot be written.
     """
-    from master.calibrate.picture import figure_of, save_figure  # matplotlib, for a picture alone
-
     figure = figure_of((13.0, 6.0))
     left, right = figure.subplots(1, 2)
     _lengths(left, measurement)

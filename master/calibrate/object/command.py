@@ -34,6 +34,7 @@ from master.calibrate.observations import (
     recorded_motion,
     rows_of,
 )
+from master.calibrate.picture import FINGER_COLOURS, draw_over_time, figure_of, save_figure
 from master.calibrate.report import Column, Table, finish
 from master.calibrate.session import Session, listening
 from master.calibrate.tree_files import (
@@ -195,8 +196,6 @@ def draw_object(path: Path, found: Measurement, profile: ObjectProfile) -> None:
     Raises:
         RecordingError: The file cannot be written.
     """
-    from master.calibrate.picture import FINGER_COLOURS, draw_over_time, figure_of, save_figure
-
     bundle, own = found.bundle, np.array([profile.markers[name].position_m for name in found.names])
     # Where each observation lies in the object: the bead less its residual, turned into its frame.
     rotation = fit_rigid(own, bundle.beads_m)[:3, :3]

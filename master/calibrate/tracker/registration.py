@@ -24,6 +24,7 @@ from common.errors import CalibrationError, FitError, RecordingError
 from common.geometry.transforms import rotation_vector_to_matrix
 from common.messages import ObjectPose, ObjectSource, TrackerPose
 from common.recording.recorded_files import read_npz, write_npz
+from master.calibrate.picture import BLUE, GREEN, GREY, ORANGE, draw_over_time, figure_of, save_figure
 from master.calibrate.report import finish
 from master.calibrate.session import Session, listening
 from master.calibrate.tracker.fit import Fit, first_places, fit_registration, late_sigma_s, sigma_at
@@ -342,8 +343,6 @@ def draw_registration(path: Path, found: Registration) -> None:
     Raises:
         RecordingError: The file cannot be written.
     """
-    from master.calibrate.picture import BLUE, GREEN, GREY, ORANGE, draw_over_time, figure_of, save_figure
-
     fit = found.fit
     figure = figure_of((17.0, 8.4))
     figure.suptitle("\n".join(report_lines(found)[:2]))

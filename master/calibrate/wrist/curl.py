@@ -6,6 +6,7 @@ principal axis is taken: along which line the point moves, and how far.
 
 from argparse import Namespace
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from common.errors import FitError
 from common.geometry.transforms import intersect_plane
 from common.hand.model import FINGERS
 from common.hand.wrist import laser_plane_of
+from master.calibrate.picture import draw_curls
 from master.calibrate.report import finish
 from master.calibrate.tree_files import provenance, refusals_named
 from master.calibrate.wrist.device import Device, device_of, writes_rig
@@ -116,16 +118,10 @@ def curl(options: Namespace) -> None:
     laser_m = read_curled(options.detections, device)
     with refusals_named(options.recording):
         curls = fit_curls(laser_m)
-
-    def draw(path: Path) -> None:
-        from master.calibrate.picture import draw_curls
-
-        draw_curls(path, curls)
-
     summary = ", ".join(found.finger for found in curls if found.line is not None)
     write = writes_rig(device, rig_with_lines(device, curls), f"finger_lines of {summary}")
     fingers = {found.finger: _json_of(found) for found in curls}
-    finish(options, report_lines(curls), {"fingers": fingers}, draw, write)
+    finish(options, report_lines(curls), {"fingers": fingers}, partial(draw_curls, curls=curls), write)
 
 
 def report_lines(curls: tuple[FingerCurl, ...]) -> list[str]:

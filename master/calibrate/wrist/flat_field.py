@@ -16,7 +16,7 @@ in the middle half to two.
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from typing import cast
 
 import cv2
@@ -31,6 +31,7 @@ from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import transform
 from common.recording.frame_recording import Illumination
 from master.calibrate.cameras.boards import Board, board_in, grid_shape
+from master.calibrate.picture import draw_flat_field
 from master.calibrate.report import finish
 from master.calibrate.tree_files import provenance, refusals_named
 from master.calibrate.wrist.device import (
@@ -254,13 +255,8 @@ def flat_field(options: Namespace) -> None:
         "views": seen.views,
         "refused": dict(seen.refused),
     }
-
-    def draw(path: Path) -> None:
-        from master.calibrate.picture import draw_flat_field
-
-        draw_flat_field(path, fit, seen.samples, device.optics)
-
     lines = report_lines(fit, seen, len(views), known_leds=bool(device.rig.led))
+    draw = partial(draw_flat_field, fit=fit, samples=seen.samples, optics=device.optics)
     finish(options, lines, report, draw, writes_rig(device, rig_with_field(device, fit, seen), "flat_field"))
 
 

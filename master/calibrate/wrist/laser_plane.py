@@ -10,8 +10,8 @@ well, and what is not known to a tenth of a degree and of a millimetre is refuse
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 from msgspec.structs import replace
@@ -26,6 +26,7 @@ from common.geometry.transforms import cross
 from common.recording.frame_recording import Illumination
 from master.calibrate.adjust import Normal, minimise
 from master.calibrate.cameras.boards import Board, board_in
+from master.calibrate.picture import draw_cloud, draw_plane
 from master.calibrate.report import finish
 from master.calibrate.tree_files import provenance, refusals_named
 from master.calibrate.wrist.device import (
@@ -317,13 +318,8 @@ def laser_plane(options: Namespace) -> None:
     with refusals_named(options.source, grouped_by_reason(seen.refused)):
         fit = fit_plane(seen.lines)
     note = f"{int(fit.used.sum())} of {len(fit.used)} views of a board"
-
-    def draw(path: Path) -> None:
-        from master.calibrate.picture import draw_plane
-
-        draw_plane(path, fit, seen.lines, device.optics)
-
     write = writes_rig(device, rig_with_plane(device, fit, note), "laser_plane")
+    draw = partial(draw_plane, fit=fit, lines=seen.lines, optics=device.optics)
     finish(options, report_lines(fit, seen, len(views)), report_json(fit, seen), draw, write)
 
 
@@ -343,14 +339,10 @@ def _of_cloud(options: Namespace) -> None:
             f"less certain than a board's views have to be ({np.degrees(NORMAL_LIMIT_RAD):.1f} deg,"
             f" {1e3 * _OFFSET_LIMIT_M:.1f} mm)"
         )
-
-    def draw(path: Path) -> None:
-        from master.calibrate.picture import draw_cloud
-
-        draw_cloud(path, fit, points, np.repeat(fit.used, [len(p) for p in found.lines.points_m]))
-
     over = {} if found.over_all is None else {"over_all": plane_json(found.over_all)}
     write = writes_rig(device, rig_with_plane(device, fit, used), "laser_plane")
+    own = np.repeat(fit.used, [len(p) for p in found.lines.points_m])
+    draw = partial(draw_cloud, fit=fit, points_m=points, used=own)
     finish(options, lines, plane_json(fit) | {"points": len(points)} | over, draw, write)
 
 

@@ -10,6 +10,7 @@ comes out and is refused.
 from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration, l
 from common.errors import CalibrationError, FitError
 from common.hand.model import CHAINS, FINGERS, HandModel
 from common.messages import WristDetections
+from master.calibrate.picture import draw_subject
 from master.calibrate.report import finish
 from master.calibrate.tree_files import matrix_of, provenance, refusals_named, write_hand, write_rig
 from master.calibrate.wrist.device import device_of
@@ -248,16 +250,12 @@ def subject(options: Namespace) -> None:
         found = calibrate_subject(cycles, device.rig, device.camera, profile, device.source)
     hand = replace(found.hand, name=options.name or profile.name)
 
-    def draw(path: Path) -> None:
-        from master.calibrate.picture import draw_subject
-
-        draw_subject(path, found, device.optics)
-
     def write(out: Path) -> dict[Path, str]:
         rig = write_rig(out, device.file_name, replace(found.rig, hand=hand.name))
         own = "knuckles, lengths and palmar_scale of index ... little"
         return {rig: "T_camera_palm, hand", write_hand(out, hand): own}
 
+    draw = partial(draw_subject, found=found, optics=device.optics)
     finish(options, found.report, summary(found), draw, write)
 
 
