@@ -161,10 +161,7 @@ def _add_unfolded(normal: Normal, bundle: Bundle, free: Bool, sigma_px: float) -
             terms = kept & np.isin(np.arange(9), (4, 5, 8))
             r2 = float(((centre / lens[:2]) ** 2).sum())
             by = np.array([0, 0, 0, 0, 3 * r2, 5 * r2**2, 0, 0, 7 * r2**3]) * sigma_px / 0.3
-            at, row, away = column[terms], by[terms], float(by @ lens)
-            normal.cost += away**2
-            normal.shared[np.ix_(at, at)] += np.outer(row, row)
-            normal.gradient[at] += row * away
+            normal.add(np.array([[by @ lens]]), by[None, None, terms], columns=column[terms])
 
 
 def predict(bundle: Bundle, seen: Observation) -> Float:

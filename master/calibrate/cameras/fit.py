@@ -13,6 +13,7 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.errors import FitError
+from common.geometry.lens import Fold, Lens, fold_of
 from common.geometry.transforms import fit_rigid, invert, transform
 from master.calibrate.cameras.boards import Board, board_corners, orderings
 from master.calibrate.cameras.bundle import Bundle, Free, Observation, Solution, predict, project, rms, solve
@@ -365,12 +366,9 @@ def _determined(solution: Solution, lenses: Bool) -> Bool:
     """The free terms (C, 9) without the next insignificant one of each camera."""
     kept = lenses.copy()
     for camera, lens in enumerate(solution.bundle.lenses):
-        if (higher := [term for term in (8, 5) if kept[camera, term]]) and _folds(
-            lens, solution.bundle.centre_px[camera]
-        ):
-            kept[camera, higher[0]] = (
-                False  # what folds the lens before the corner of the image is not known there
-            )
+        higher = [term for term in (8, 5) if kept[camera, term]]
+        if higher and _fold(lens, solution.bundle.centre_px[camera]) is not None:
+            kept[camera, higher[0]] = False  # what folds the lens inside the image is not known there
             continue
         for term in _TERMS:
             index = list(term)
@@ -389,12 +387,11 @@ def _determined(solution: Solution, lenses: Bool) -> Bool:
     return kept
 
 
-def _folds(lens: Float, centre_px: Float) -> bool:
-    """Whether the distortion of a lens turns back inside the image."""
-    r2 = np.linspace(0.0, 1.0, 50) * float(
-        (((centre_px + np.abs(lens[2:4] - centre_px)) / lens[:2]) ** 2).sum()
-    )
-    return bool((1.0 + 3.0 * lens[4] * r2 + 5.0 * lens[5] * r2**2 + 7.0 * lens[8] * r2**3).min() <= 0.0)
+def _fold(values: Float, centre_px: Float) -> Fold | None:
+    """Where a lens (9,) turns back inside the image, whose middle is at `centre_px`."""
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = values.tolist()
+    width, height = np.rint(2.0 * centre_px + 1.0).astype(int).tolist()
+    return fold_of(Lens((width, height), (fx, fy), (cx, cy), (k1, k2, p1, p2, k3)))
 
 
 def _check_enough(

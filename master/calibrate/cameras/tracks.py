@@ -32,6 +32,8 @@ from master.calibrate.cameras.views import (
     BoardViews,
     Finder,
     View,
+    files_by_folder,
+    files_in,
     load_image,
     moved_px,
     natural,
@@ -209,34 +211,31 @@ def streams_of(
     if not folder.is_dir() or (folder / MANIFEST).is_file():
         return None
     table, videos = _table_in(folder), _videos_in(folder)
-    pictures = {sub.name: _files(sub, ENDINGS) for sub in sorted(folder.iterdir()) if sub.is_dir()}
-    pictures = {
-        name: sorted(own, key=lambda file: natural(file.stem)) for name, own in pictures.items() if own
-    }
-    found = videos or (pictures if table is not None else {})
+    if not videos and table is None:
+        return None
+    pictures = {} if videos else files_by_folder(folder, ENDINGS)
+    found = videos or pictures
     if not found:
         return None
     if missing := [camera for camera in cameras if camera not in found]:
         raise RecordingError(f"{folder}: nothing of camera {missing[0]!r}; there are {', '.join(found)}")
     wanted = cameras or tuple(found)
-    if videos:
+    if table is None or videos:
         return _of_videos({name: videos[name] for name in wanted}, table, notify)
-    times = times_of(table, {name: len(pictures[name]) for name in wanted}) if table else {}
+    times = times_of(table, {name: len(pictures[name]) for name in wanted})
+    ordered = {name: sorted(pictures[name], key=lambda file: natural(file.stem)) for name in wanted}
     return {
-        name: Stream(*times[name], lambda k, own=pictures[name]: load_image(own[k]), str(folder / name))
-        for name in wanted
+        name: Stream(*times[name], lambda k, own=own: load_image(own[k]), str(folder / name))
+        for name, own in ordered.items()
     }
 
 
 def _videos_in(folder: Path) -> dict[str, Path]:
     """Camera -> its video: named as the camera, or alone in a folder that is."""
-    found = {file.stem: file for file in _files(folder, VIDEOS)}
-    for sub in sorted(folder.iterdir()) if not found else ():
-        own = _files(sub, VIDEOS) if sub.is_dir() else []
-        if len(own) > 1:
-            found |= {file.stem: file for file in own}
-        elif own:
-            found[sub.name] = own[0]
+    if found := {file.stem: file for file in files_in(folder, VIDEOS)}:
+        return found
+    for name, own in files_by_folder(folder, VIDEOS).items():
+        found |= {name: own[0]} if len(own) == 1 else {file.stem: file for file in own}
     return found
 
 
@@ -347,11 +346,3 @@ def times_of(path: Path, counts: Mapping[str, int]) -> dict[str, tuple[tuple[int
 def _number(name: str) -> int | None:
     digits = re.search(r"(\d+)$", name)
     return None if digits is None else int(digits[1])
-
-
-def _files(folder: Path, endings: Sequence[str]) -> list[Path]:
-    return sorted(
-        file
-        for file in folder.iterdir()
-        if file.suffix.lower() in endings and file.is_file() and not file.name.startswith(".")
-    )

@@ -182,11 +182,10 @@ def image_sets(folder: Path, cameras: Sequence[str] = ()) -> list[tuple[str, Ima
         raise RecordingError(f"{folder}: is not a folder")
     if (folder / MANIFEST).is_file():
         return _of_recording(folder, cameras)
-    files = _images(folder)
+    files = files_in(folder, ENDINGS)
     if files:
         return _matched(folder, _by_prefix(folder, files, cameras))
-    nested = {sub.name: _images(sub) for sub in sorted(folder.iterdir()) if sub.is_dir()}
-    nested = {name: found for name, found in nested.items() if found}
+    nested = files_by_folder(folder, ENDINGS)
     if not nested:
         raise RecordingError(f"{folder}: no images here, nor in a folder per camera ({', '.join(ENDINGS)})")
     if missing := [camera for camera in cameras if camera not in nested]:
@@ -198,12 +197,19 @@ def image_sets(folder: Path, cameras: Sequence[str] = ()) -> list[tuple[str, Ima
     )
 
 
-def _images(folder: Path) -> list[Path]:
+def files_in(folder: Path, endings: Sequence[str]) -> list[Path]:
+    """The files of a folder with one of these endings, by name."""
     return sorted(
         file
         for file in folder.iterdir()
-        if file.suffix.lower() in ENDINGS and file.is_file() and not file.name.startswith(".")
+        if file.suffix.lower() in endings and file.is_file() and not file.name.startswith(".")
     )
+
+
+def files_by_folder(folder: Path, endings: Sequence[str]) -> dict[str, list[Path]]:
+    """Name of each folder below that has such files -> its files."""
+    below = {sub.name: files_in(sub, endings) for sub in sorted(folder.iterdir()) if sub.is_dir()}
+    return {name: found for name, found in below.items() if found}
 
 
 def _by_prefix(folder: Path, files: list[Path], cameras: Sequence[str]) -> dict[str, dict[str, Path]]:
