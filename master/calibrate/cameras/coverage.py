@@ -18,8 +18,7 @@ from master.calibrate.cameras.boards import Board, ImageObservation, board_corne
 from master.calibrate.cameras.bundle import guess_lens, place_board, rms
 from master.calibrate.cameras.fit import CamerasFit
 from master.calibrate.cameras.outliers import corners_seen
-from master.calibrate.cameras.tracks import is_new
-from master.calibrate.cameras.views import BoardViews, Finder, View, moved_px
+from master.calibrate.cameras.views import BoardViews, Finder, View, is_new, moved_px
 from master.calibrate.picture import figure_of, save_figure
 
 if TYPE_CHECKING:

@@ -34,8 +34,8 @@ from master.calibrate.cameras.views import (
     View,
     files_by_folder,
     files_in,
+    is_new,
     load_image,
-    moved_px,
     natural,
 )
 
@@ -129,24 +129,6 @@ class Tracks:
 
 
 _NEW = 0.01  # of the image's width: how far corners must be from where another view has them
-
-
-def is_new(
-    seen: Mapping[str, ImageObservation],
-    views: list[View],
-    sizes_px: Mapping[str, tuple[int, int]],
-    share: float,
-) -> bool:
-    """Whether a camera sees the board as in no view, or the set of cameras is new.
-
-    `share` of the image's width is how far corners must be from where a view has them.
-    """
-    for view in views:
-        if set(seen) <= set(view.observations):
-            moved = (moved_px(now, view.observations[name]) / sizes_px[name][0] for name, now in seen.items())
-            if max(moved) < share:
-                return False
-    return True
 
 
 def track(board: Board, streams: Mapping[str, Stream], progress: Callable[[str], None]) -> Tracks:

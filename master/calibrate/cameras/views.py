@@ -142,6 +142,24 @@ def moved_px(now: ImageObservation, then: ImageObservation) -> float:
     return float(np.sqrt((step[both] ** 2).sum(axis=1).mean())) if both.any() else float("inf")
 
 
+def is_new(
+    seen: Mapping[str, ImageObservation],
+    views: list[View],
+    sizes_px: Mapping[str, tuple[int, int]],
+    share: float,
+) -> bool:
+    """Whether a camera sees the board as in no view, or the set of cameras is new.
+
+    `share` of the image's width is how far corners must be from where a view has them.
+    """
+    for view in views:
+        if set(seen) <= set(view.observations):
+            moved = (moved_px(now, view.observations[name]) / sizes_px[name][0] for name, now in seen.items())
+            if max(moved) < share:
+                return False
+    return True
+
+
 def _likely_mistakes(board: Board) -> Iterator[Board]:
     """Boards that a user may mean: squares counted, sides swapped, other family."""
     c, r = board.columns, board.rows
