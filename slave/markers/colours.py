@@ -298,7 +298,7 @@ class SampledColours:
         _refuse_poor(rows[marker])
         made = {name: rows[name].range for name in picked}
         kept = {
-            name: _apart(colour, circular_median(samples[name][:, 0]), made)
+            name: _without_hues_of(colour, circular_median(samples[name][:, 0]), made)
             for name, colour in ranges.items()
             if name not in picked
         }
@@ -400,7 +400,7 @@ def _refuse_poor(row: ColourRow) -> None:
         )
 
 
-def _apart(colour: HsvRange, hue: float, made: Mapping[str, HsvRange]) -> HsvRange:
+def _without_hues_of(colour: HsvRange, hue: float, made: Mapping[str, HsvRange]) -> HsvRange:
     """Return a range without the hues of the picked colours, about its own hue."""
     low, high = colour.hsv_low[0], colour.hsv_high[0]
     middle = round(hue) % HUES

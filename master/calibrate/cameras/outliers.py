@@ -278,11 +278,11 @@ def judge(
             parted[view] = _to_part(seen, own, bundle, sigma, bound)
             cameras = "" if len(parted[view]) == len(own) else "".join(parted[view])
             notes.append(Rejection(view, cameras, _disagreement(own, parted[view], error / typical)))
-    placed = (_apart(shot) if shot.camera in parted.get(shot.view, ()) else shot for shot in good)
+    placed = (_at_own_place(shot) if shot.camera in parted.get(shot.view, ()) else shot for shot in good)
     return tuple(placed), tuple(notes)
 
 
-def _apart(shot: Shot) -> Shot:
+def _at_own_place(shot: Shot) -> Shot:
     return replace(shot, place=f"{shot.view} {shot.camera}")
 
 
@@ -290,7 +290,7 @@ def _judge_images(
     seen: Seen, shots: Sequence[Shot], bundle: Bundle
 ) -> tuple[tuple[Shot, ...], tuple[Rejection, ...], Float]:
     """Good shots, rejections, and each camera's robust standard deviation (C,) [px]."""
-    residuals = _settled(seen, [_apart(shot) for shot in shots], bundle)
+    residuals = _settled(seen, [_at_own_place(shot) for shot in shots], bundle)
     errors = np.array([rms([r]) for r in residuals])
     dof = np.array([2.0 * len(r) - 6.0 for r in residuals])
     good = np.ones(len(shots), dtype=np.bool_)
@@ -433,7 +433,7 @@ def _errors(seen: Seen, training: Sequence[Shot], held_out: Sequence[Shot], mode
     squares = np.zeros(1 + max(o.view for o in found))
     count = np.zeros_like(squares)
     for odd in (False, True):
-        for view, square in _predicted(found, fitted, _odd(seen.views.board), odd=odd):
+        for view, square in _predicted(found, fitted, _every_second(seen.views.board), odd=odd):
             squares[view] += square.sum()
             count[view] += len(square)
     with np.errstate(invalid="ignore"):
@@ -469,7 +469,7 @@ def _only(seen: Observation, which: Bool) -> Observation:
     return replace(seen, corners=seen.corners[which], uv=seen.uv[which], speed=speed)
 
 
-def _odd(board: Board) -> Bool:
+def _every_second(board: Board) -> Bool:
     """Mask (N,) of every second corner, so that either half spans the board."""
     row, column = np.indices(grid_shape(board))
     return np.asarray((row + column) % 2 == 1, dtype=np.bool_).ravel()

@@ -57,18 +57,18 @@ def read_pairs(
     first, second = (list(recorded_detections(detections, camera, len(names))) for camera in cameras)
     index = _target([*first, *second], names) if marker is None else names.index(marker)
     limit_ns = round(0.5e9 / min(recording.manifest.cameras[camera].frame_rate_hz for camera in cameras))
-    together = list(_together(first, second, limit_ns))
-    if not together:
+    matched = list(_nearest_pairs(first, second, limit_ns))
+    if not matched:
         raise RecordingError(
             f"{detections}: no frame of {cameras[1]!r} lies within {limit_ns * 1e-6:.1f} ms, half a frame, of one of"
             f" {cameras[0]!r}: were both recorded at the same time, on one clock?"
         )
     return Pairs(
-        np.array([a.t_ns for a, _ in together], np.int64),
-        np.array([a.seq for a, _ in together], np.int64),
-        np.array([[m.uv[index] for m in side] for side in zip(*together, strict=True)]),
-        np.array([[m.area[index] for m in side] for side in zip(*together, strict=True)]),
-        np.array([[m.sigma_px[index] for m in side] for side in zip(*together, strict=True)]),
+        np.array([a.t_ns for a, _ in matched], np.int64),
+        np.array([a.seq for a, _ in matched], np.int64),
+        np.array([[m.uv[index] for m in side] for side in zip(*matched, strict=True)]),
+        np.array([[m.area[index] for m in side] for side in zip(*matched, strict=True)]),
+        np.array([[m.sigma_px[index] for m in side] for side in zip(*matched, strict=True)]),
     ), names[index]
 
 
@@ -220,7 +220,7 @@ def _target(messages: Sequence[MarkerDetections], names: tuple[str, ...]) -> int
     return seen[0]
 
 
-def _together(
+def _nearest_pairs(
     first: Sequence[MarkerDetections], second: Sequence[MarkerDetections], limit_ns: int
 ) -> list[tuple[MarkerDetections, MarkerDetections]]:
     """Messages of the first camera with the second's nearest, within `limit_ns`."""

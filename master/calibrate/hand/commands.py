@@ -52,7 +52,7 @@ def hand_command(options: Namespace) -> None:
         raise CalibrationError("--joints, --unit and --rate are for --from FILE")
     side = options.side or "right"
     template = template_of(options.base, side, options.name)
-    _check_together(options.poses, options.live, options.length_mm, options.three_back)
+    _check_options(options.poses, options.live, options.length_mm, options.three_back)
     if options.poses is None and options.length_mm is not None and not options.live:
         report: dict[str, object] = {"side": side, "hand_length_mm": options.length_mm, "lengths": {}}
         scaled = quick(options.base, template, options.length_mm)
@@ -96,7 +96,7 @@ def _check_alone(options: Namespace) -> None:
             raise CalibrationError(f"--{name.replace('_', '-')} has no meaning with --from: leave it out")
 
 
-def _check_together(poses: Path | None, live: bool, length_mm: float | None, three_back: bool) -> None:
+def _check_options(poses: Path | None, live: bool, length_mm: float | None, three_back: bool) -> None:
     if live and poses is not None:
         raise CalibrationError("--poses has no meaning with --live: leave it out")
     if poses is None and not live and length_mm is None:

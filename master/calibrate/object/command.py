@@ -52,7 +52,7 @@ TOOL = "calibrate object"
 
 def object_command(options: Namespace) -> None:
     """Measure where the beads of a rigid object sit."""
-    _check_together(options)
+    _check_options(options)
     base, where = base_of(options.calibration, options.name, options.like)
     given = None
     if options.markers is not None:
@@ -257,7 +257,7 @@ def radii(names: tuple[str, ...], radius_mm: float | None, base: ObjectProfile |
     }
 
 
-def _check_together(options: Namespace) -> None:
+def _check_options(options: Namespace) -> None:
     live: bool = options.live
     if live == (options.recording is not None) or live == (options.detections is not None):
         raise CalibrationError("give --live, or --recording FOLDER and --detections DIR of the motion")

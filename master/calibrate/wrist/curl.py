@@ -58,7 +58,7 @@ def _curl(finger: str, laser_m: Float) -> FingerCurl:
     if len(seen) < MIN_POINTS:
         reason = f"{len(seen)} points, at least {MIN_POINTS} are needed"
         return FingerCurl(finger, seen, len(seen), None, reason)
-    points = seen[_together(seen)]
+    points = seen[_on_one_line(seen)]
     axis = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][0]
     moved = float(np.ptp(points @ axis))
     # of 60 to 100 mm: below it was no curl, and a short line's direction is that of the noise
@@ -74,7 +74,7 @@ def _curl(finger: str, laser_m: Float) -> FingerCurl:
         return FingerCurl(finger, points, len(seen), None, str(error))
 
 
-def _together(points: Float) -> Bool:
+def _on_one_line(points: Float) -> Bool:
     """The points (N,) on the line that most of them share; another finger's are not."""
     rng = np.random.default_rng(0)
     pairs = 300
