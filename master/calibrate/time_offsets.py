@@ -1,4 +1,4 @@
-"""The command `phalanx calibrate time` measures how late camera frames are.
+"""`phalanx calibrate cameras time` measures how late frames of cameras are.
 
 A recording of a moving hand enters, offsets of the cameras' stamps leave. The estimator is that of the
 running master (`master.monitor.clocks`), over the whole recording and every frame. It is linear in the
@@ -138,7 +138,7 @@ def time_command(options: Namespace) -> None:
 
     def write(out: Path) -> dict[Path, str]:
         residual = {f"{time.camera}_sigma_us": round(1e-3 * time.offset.sigma_ns, 1) for time in times}
-        how = provenance("calibrate time", (motion.data,), residual, f"against {rig.cameras[0]}")
+        how = provenance("calibrate cameras time", (motion.data,), residual, f"against {rig.cameras[0]}")
         offsets = {time.camera: time.to_write_us for time in times}
         return write_into_rig(out, file_name, rig, {"stamp_offset_us": how}, stamp_offset_us=offsets)
 

@@ -86,22 +86,23 @@ def add_sweep(command: ArgumentParser) -> None:
 
 
 def board(command: ArgumentParser) -> None:
-    """Draw a calibration board at true scale.
+    """Draw a calibration board, or the net of a box of tags, at true scale.
 
-    Beside it are a ruler of 100 mm and the options to calibrate with it.
-
-    Print at 100 %, measure the ruler, and glue the print on something flat.
+    Print at 100 % and measure the ruler of 100 mm. Glue a board on something flat; the page shows the options to
+    calibrate with it. Glue the net round a box of that size: CALIBRATION/objects/NAME.json describes the box, and the
+    rig names it under `objects`.
 
     Examples:
       phalanx calibrate board -o board.pdf
       phalanx calibrate board --paper A3 --board 11x7 --square-mm 36 -o board.pdf
       phalanx calibrate board --kind checkerboard -o board.pdf
+      phalanx calibrate board --kind box --name mug --side-mm 50 --edge-mm 38 -o mug.pdf
     """
     command.add_argument(
         "--out", "-o", type=Path, required=True, metavar="FILE", help="file to write, .pdf or .svg"
     )
-    add_choice(command, "--kind", ("charuco", "checkerboard"), "kind of board", default="charuco")
-    add_text(command, "--paper", "PAPER", "a4, A3, A2 or letter", default="A4")
+    add_choice(command, "--kind", ("charuco", "checkerboard", "box"), "what is printed", default="charuco")
+    add_text(command, "--paper", "PAPER", "of a board: A4, A3, A2 or letter. Default: A4")
     add_text(
         command,
         "--board",
@@ -112,6 +113,25 @@ def board(command: ArgumentParser) -> None:
     add_number(command, "--square-mm", "MM", "side of a square. Default: 29, of a checkerboard 25")
     add_number(command, "--marker-mm", "MM", "side of a marker. Default: 3/4 square")
     add_dictionary(command)
+    add_text(command, "--name", "NAME", "of a box: name of the object", default="box")
+    families = ("apriltag_16h5", "apriltag_25h9", "apriltag_36h11", "aruco_4x4_50", "aruco_5x5_100")
+    add_choice(
+        command,
+        "--family",
+        (*families, "aruco_6x6_250"),
+        "of a box: family of its tags",
+        default="aruco_5x5_100",
+    )
+    add_number(command, "--first", "N", "of a box: number of its first tag", whole(), default=0)
+    add_number(command, "--side-mm", "MM", "of a box: its side", default=40.0)
+    add_number(
+        command,
+        "--edge-mm",
+        "MM",
+        "of a box: edge of the black squares, as measured on the print",
+        default=30.0,
+    )
+    add_calibration(command, "objects/, for the file of a box")
 
 
 def intrinsics(command: ArgumentParser) -> None:
@@ -173,14 +193,18 @@ def capture(command: ArgumentParser) -> None:
 
 
 def depth(command: ArgumentParser) -> None:
-    """Fit depth to disparity from a target at known distances.
+    """Fit depth to disparity from a target at known distances; or verify a rig's.
 
-    The power law D = k x^z, and x = a/D + x0.
+    The laws are D = k x^z and x = a/D + x0. With --verify nothing is fitted: the error of each depth model of the rig
+    is measured at these distances, beside what noise and time let expect. Without a recording or a table, --verify
+    prints only what to expect, and the error off the axis.
 
     Examples:
       phalanx calibrate depth RECORDING --detections DIR --distances 1.00:0.20:-0.05 --out calib_json
       phalanx calibrate depth sweep.csv                       columns distance_m,disparity_px
       phalanx calibrate depth --live --rig desk --marker index --out calib_json
+      phalanx calibrate depth RECORDING --detections DIR --distances 1.00:0.20:-0.05 --rig desk --verify
+      phalanx calibrate depth --rig desk --verify             what to expect, without a measurement
     """
     add_sweep(command)
     add_out(command)
@@ -193,34 +217,20 @@ def depth(command: ArgumentParser) -> None:
     add_path(command, "--save", "FILE", "with --live: keep the readings in this .csv", dest="save_table")
     add_number(command, "--frames", "N", "with --live: frames to average, at least", whole(8), default=30)
     add_number(command, "--seconds", "S", "with --live: time to average", number(1.0, 60.0), default=1.0)
+    add_flag(command, "--verify", "fit nothing: report how right the depth of the rig is")
+    sigma, apart = (
+        "noise of a centroid, one camera, per axis, in px",
+        "uncorrected time between the two exposures",
+    )
+    add_number(command, "--sigma-px", "N", f"with --verify: {sigma}", default=0.1)
+    add_number(
+        command, "--speed-m-s", "N", "with --verify: sideways speed for the budget, in m/s", default=1.0
+    )
+    add_number(command, "--skew-ms", "N", f"with --verify: {apart}, in ms", default=0.5)
+    angles = "with --verify: angles to the side, in degrees, for the off-axis table"
+    add_text(command, "--angles", "ANGLES", angles, default="-20:20:10")
     add_link(command)
     add_keys(command)
-
-
-def verify(command: ArgumentParser) -> None:
-    """Report how accurate a rig is.
-
-    Error of each depth model at known distances, and the budget of what to expect.
-
-    Without a recording or a table only the budget and the off-axis errors of the rig are printed.
-
-    Examples:
-      phalanx calibrate verify RECORDING --detections DIR --distances 1.00:0.20:-0.05 --rig desk
-      phalanx calibrate verify --rig desk
-    """
-    add_sweep(command)
-    add_number(command, "--sigma-px", "N", "noise of a centroid, one camera, per axis, in px", default=0.1)
-    add_number(command, "--speed-m-s", "N", "sideways speed for the budget, in m/s", default=1.0)
-    add_number(command, "--skew-ms", "N", "uncorrected time between the two exposures, in ms", default=0.5)
-    add_text(
-        command,
-        "--angles",
-        "ANGLES",
-        "angles to the side, in degrees, for the off-axis table",
-        default="-20:20:10",
-    )
-    add_json(command)
-    add_picture(command, "the errors")
 
 
 def time(command: ArgumentParser) -> None:
@@ -231,8 +241,8 @@ def time(command: ArgumentParser) -> None:
     Offsets are against the first camera of the rig. The master adds them to the times of every frame.
 
     Examples:
-      phalanx calibrate time RECORDING --detections DIR
-      phalanx calibrate time RECORDING --detections DIR --rig desk --out calib_json
+      phalanx calibrate cameras time RECORDING --detections DIR
+      phalanx calibrate cameras time RECORDING --detections DIR --rig desk --out calib_json
     """
     add_path(command, "recording", "RECORDING", "folder of a raw-frame recording: a hand that moves")
     add_path(command, "--detections", "DIR", "folder with detections_<camera>.npz of it", required=True)

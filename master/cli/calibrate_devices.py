@@ -1,9 +1,8 @@
 """Options of `phalanx calibrate` for wrist device, object and tracker."""
 
 from argparse import ArgumentParser
-from pathlib import Path
 
-from common.command_line import number, whole
+from common.command_line import number
 from master.cli.calibrate import add_board, add_markers_of_board
 from master.commands.options import (
     add_bus,
@@ -221,41 +220,6 @@ def tracker(command: ArgumentParser) -> None:
     add_path(command, "--keep", "FILE", "keep the live motion in this .npz")
     add_results(command, "what was seen and left")
     add_bus(command)
-
-
-def cube(command: ArgumentParser) -> None:
-    """Draw the net of a box of tags at true scale and write objects/<name>.json.
-
-    Print at 100 %, measure the ruler, glue it round a box of that size. Name the object under `objects` of the rig.
-
-    Examples:
-      phalanx calibrate cube -o box.pdf
-      phalanx calibrate cube --name mug --side-mm 50 --edge-mm 38 -o mug.pdf
-    """
-    command.add_argument(
-        "--out", "-o", type=Path, required=True, metavar="FILE", help="page to write, .pdf or .svg"
-    )
-    add_text(command, "--name", "NAME", "name of the object", default="box")
-    add_calibration(command, "objects/")
-    add_choice(
-        command,
-        "--family",
-        (
-            "apriltag_16h5",
-            "apriltag_25h9",
-            "apriltag_36h11",
-            "aruco_4x4_50",
-            "aruco_5x5_100",
-            "aruco_6x6_250",
-        ),
-        "family of the tags",
-        default="aruco_5x5_100",
-    )
-    add_number(command, "--first", "N", "number of the first tag", whole(), default=0)
-    add_number(command, "--side-mm", "MM", "side of the box", default=40.0)
-    add_number(
-        command, "--edge-mm", "MM", "edge of the black squares, as measured on the print", default=30.0
-    )
 
 
 def object_options(command: ArgumentParser) -> None:

@@ -4,7 +4,7 @@ A stamp can lie: a USB camera without a clock of its own is stamped when its fir
 exposure and transfer, 8 to 10 ms; nothing that travels with the frame shows it. The tracks do
 (`master.monitor.timing_fit`). A second of frames is compared at once, one step of the work with each message.
 Nothing is corrected here: `Health` gets metrics (clocks of the slaves, phases, residual offsets), a person
-gets lines, and `phalanx calibrate time` writes the rig.
+gets lines, and `phalanx calibrate cameras time` writes the rig.
 """
 
 from collections import deque
@@ -261,7 +261,7 @@ def warning(camera: str, offset: TimeOffset) -> str:
     return (
         f"camera {camera}: its frames are {abs(late):.1f} ms (sigma {sigma:.1f}) {'later' if late > 0 else 'earlier'}"
         " than its stamps say: record a moving hand, then"
-        " `phalanx calibrate time RECORDING --detections DIR --out DIR`"
+        " `phalanx calibrate cameras time RECORDING --detections DIR --out DIR`"
     )
 
 

@@ -65,15 +65,17 @@ def test_the_published_rig(sweeps: dict[str, Sweep]) -> None:
     assert fit["best"] == "affine_disparity"
     assert all(point["used"] for point in fit["points"])
     # With the rig file that was written, in a tree whose camera files carry the lens of another recording.
-    models = sweep.calibrate("verify", *options, "--calibration", sweep.tree, "--rig", "sweep_paper")[
-        "models"
-    ]
+    models = sweep.calibrate(
+        "depth", "--verify", *options, "--calibration", sweep.tree, "--rig", "sweep_paper"
+    )["models"]
     assert models["power_law"]["mean_percent"] == pytest.approx(laws["power_law"]["mean_percent"])
     assert models["stereo"]["max_percent"] < 0.5
 
 
 def test_misaligned_and_distorted_cameras(sweeps: dict[str, Sweep]) -> None:
-    numbers = sweeps["sweep_rough"].calibrate("verify")  # distances from its truth, the rig from its manifest
+    numbers = sweeps["sweep_rough"].calibrate(
+        "depth", "--verify"
+    )  # distances from its truth, the rig from its manifest
     assert numbers["models"]["stereo"]["mean_percent"] < 0.5
     assert numbers["models"]["stereo"]["max_percent"] < 1.2
     # With the shift of the large blob's centroid corrected it is not only within the bars, but within the noise.
@@ -112,7 +114,7 @@ def test_every_depth_model_of_the_running_line_is_as_good_as_its_calibration(
 
 
 def test_the_size_of_the_target_alone_corrects_most_of_the_lens(sweeps: dict[str, Sweep]) -> None:
-    models = sweeps["sweep_rough"].calibrate("verify", "--target", "round")["models"]
+    models = sweeps["sweep_rough"].calibrate("depth", "--verify", "--target", "round")["models"]
     assert models["stereo"]["max_percent"] < 0.5
 
 

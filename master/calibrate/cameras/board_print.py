@@ -20,6 +20,7 @@ from common.calibration.files import replacing
 from common.command_line import UsageError, echo
 from common.errors import CalibrationError
 from master.calibrate.cameras.boards import Board, Charuco, Checkerboard, board_of, options_of
+from master.calibrate.object.cube_sheet import cube
 
 PAPERS_MM = {"A4": (297.0, 210.0), "A3": (420.0, 297.0), "A2": (594.0, 420.0), "letter": (279.4, 215.9)}
 _EDGE_MM = 8.0  # printers leave some millimetres blank, and a board needs white about it
@@ -144,7 +145,10 @@ def _foot(axes: Axes, page: Page, board: Board) -> None:
 
 
 def board(options: Namespace) -> None:
-    """Draw a board at true scale, with a ruler and the options to calibrate with."""
+    """Draw a board at true scale, with a ruler, or a box of tags."""
+    if options.kind == "box":
+        print_of_box(options)
+        return
     marker, side = None, options.square_mm
     if options.kind == "charuco":
         side = 29.0 if side is None else side
@@ -152,5 +156,15 @@ def board(options: Namespace) -> None:
     elif options.marker_mm is not None:
         raise UsageError("--marker-mm: a checkerboard has no markers; use --kind charuco")
     drawn = board_of(options.size or "9x6", 25.0 if side is None else side, marker, options.dictionary)
-    print_board(options.out, drawn, options.paper)
-    echo(f"wrote {options.out}: {drawn}, on {options.paper}. Print it at 100 % and measure the ruler: 100 mm")
+    paper = options.paper or "A4"
+    print_board(options.out, drawn, paper)
+    echo(f"wrote {options.out}: {drawn}, on {paper}. Print it at 100 % and measure the ruler: 100 mm")
+
+
+def print_of_box(options: Namespace) -> None:
+    """Draw a box of tags, unless an option is given that only boards have."""
+    given = {"board": options.size, "square-mm": options.square_mm, "marker-mm": options.marker_mm}
+    for name, value in (given | {"paper": options.paper}).items():
+        if value is not None:
+            raise UsageError(f"--{name}: is of a board; a box has --side-mm and --edge-mm, on A4")
+    cube(options)

@@ -33,6 +33,7 @@ from common.geometry.camera_model import CameraModel
 from master.calibrate.adjust import Normal
 from master.calibrate.depth.session import sweep_live
 from master.calibrate.depth.source import (
+    Measured,
     Pair,
     measured_from,
     parse_target,
@@ -374,7 +375,7 @@ def laws_note(report: DepthReport, rig: RigCalibration, use: str | None) -> str:
     if use is None and model != report.best:
         text += f"; --use {report.best} would switch it"
         if model == "stereo":
-            text += " (stereo, if calibrated, is better off the axis: see `calibrate verify`)"
+            text += " (stereo, if calibrated, is better off the axis: see `calibrate depth --verify`)"
     return text
 
 
@@ -386,14 +387,19 @@ def means_line(report: DepthReport) -> str:
     return f"mean error: {was}after {after}"
 
 
-def depth(options: Namespace) -> None:
-    """Fit depth to disparity from a target at known distances, by two laws."""
+def sweep_of(options: Namespace) -> Measured:
+    """The sweep that the options name: live, of a recording or of a table."""
     outline = parse_target(options.target)
     if options.live:
         refuse_idle("--live", source=options.source, detections=options.detections)
-    else:
-        refuse_idle("a measurement without --live", save=options.save_table)
-    measured = sweep_live(options, outline) if options.live else measured_from(options, outline)
+        return sweep_live(options, outline)
+    refuse_idle("a measurement without --live", save=options.save_table)
+    return measured_from(options, outline)
+
+
+def depth(options: Namespace) -> None:
+    """Fit depth to disparity from a target at known distances, by two laws."""
+    measured = sweep_of(options)
     pair = measured.pair
     base = rig_to_write(pair, options.out)
     with refusals_named(measured.data):

@@ -1,4 +1,4 @@
-"""`phalanx calibrate verify`: measured depth errors against the error budget.
+"""`phalanx calibrate depth --verify`: measured depth errors against the error budget.
 
 It gives the published table of 20...100 cm for every depth model that the rig has, as lines, numbers and a plot. Three
 things stand side by side and must not be mixed: what a sweep *measured*, at the angles at which the target stood; what
@@ -18,18 +18,8 @@ from common.arrays import Float
 from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import invert, transform
-from master.calibrate.depth.fit import (
-    draw_errors,
-    ideal_of,
-    laws_of,
-)
-from master.calibrate.depth.source import (
-    Measured,
-    Pair,
-    load_pair,
-    measured_from,
-    parse_target,
-)
+from master.calibrate.depth.fit import depth, draw_errors, ideal_of, laws_of, sweep_of
+from master.calibrate.depth.source import Measured, Pair, load_pair, refuse_idle
 from master.calibrate.depth.sweep import Sweep, check_places, parse_distances, parse_numbers
 from master.calibrate.report import Column, Table, finish, plain
 from master.calibrate.tree_files import refusals_named
@@ -238,11 +228,20 @@ def expected_json(
 _TABLE = "0.20:1.00:0.10"  # where the budget is printed
 
 
-def verify_command(options: Namespace) -> None:
+def depth_command(options: Namespace) -> None:
+    """Fit the laws of depth, or with --verify report how right the depth of a rig is."""
+    if options.verify:
+        verify_rig(options)
+    else:
+        depth(options)
+
+
+def verify_rig(options: Namespace) -> None:
     """Report each depth model's error at known distances, and the error budget."""
+    refuse_idle("--verify", out=options.out, use=options.use)
     noise = _noise(options.sigma_px, options.speed_m_s, options.skew_ms)
     lines, numbers, draw = list[str](), dict[str, object](), None
-    if options.source is None:
+    if options.source is None and not options.live:
         pair = load_pair(options.calibration, options.rig or "desk", options.fov_deg)
         distance = parse_distances(options.distances or _TABLE)
         if options.picture is not None:
@@ -250,7 +249,7 @@ def verify_command(options: Namespace) -> None:
                 "--picture: there are no measured errors to draw; give a recording or a .csv"
             )
     else:
-        measured = measured_from(options, parse_target(options.target))
+        measured = sweep_of(options)
         pair, distance = measured.pair, parse_distances(_TABLE)
         found = _verified(measured, noise)
         lines += _measured_lines(measured, found)

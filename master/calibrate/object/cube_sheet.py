@@ -1,4 +1,4 @@
-"""The command `phalanx calibrate cube` draws a box of tags to cut and fold.
+"""`phalanx calibrate board --kind box` draws a box of tags to cut and fold.
 
 Its five faces are one net at true scale; the object's file is written too. The top is in the middle of the
 net and the four sides stand about it, each with its upper edge at the top. The frame of the object is in the

@@ -155,7 +155,7 @@ VIEWS = {
 }
 
 # Where a command writes a page to print, or pictures; all others write a tree of files.
-_OUT = {"board": "board.pdf", "cube": "box.pdf", "capture": "views"}
+_OUT = {"board": "board.pdf", "capture": "views"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,7 +225,7 @@ class Commands:
     def calibrate(self, command: str, values: Mapping[str, Value], work: Path, *, live: bool) -> list[str]:
         """Return the command line of a calibration that writes below `work`.
 
-        It uses the form's `values` and what the page knows.
+        The last word of its name is `command`. It uses the form's `values` and what the page knows.
 
         Raises:
             CalibrationError: A field is empty that is needed, or a number is none.
@@ -233,7 +233,7 @@ class Commands:
         fields = fields_of(CALIBRATIONS[command])
         names = {field.name for field in fields}
         known: dict[str, Value] = {
-            "calibration": str(work / "tree" if command == "cube" else self.tree),
+            "calibration": str(work / "tree" if command == "board" else self.tree),
             "rig": self.plan.rig,
             "beacon": self.settings.beacon,
             "bind": self.settings.bind,
@@ -243,8 +243,10 @@ class Commands:
             "live": live,
             "out": str(work / _OUT.get(command, "tree")),
         }
-        if command == "verify" and not values.get("source"):
-            del known["picture"]  # what is to be expected is a table
+        if values.get("verify"):
+            del known["out"]  # nothing is fitted
+            if not values.get("source"):
+                del known["picture"]  # what is to be expected is a table
         merged = {**values, **{name: value for name, value in known.items() if name in names}}
         words = CALIBRATIONS[command].name.split()
         return [*_MODULE, "master", *words, *arguments_of(fields, merged)]

@@ -58,7 +58,7 @@ class _Steps:
         return next((step.key for step in self._all() if step.state is not Done.DONE), "track")
 
     def go(self, key: str) -> None:
-        """Open the panel of a step, or `wizard/COMMAND`."""
+        """Open the panel of a step, or `wizard/NAME`."""
         self._here = self._session.here = key
         self._desk.problem.set_text("")
         self._panel.clear()

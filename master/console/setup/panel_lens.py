@@ -89,7 +89,7 @@ def panel_more(desk: Desk) -> None:
                 with ui.card():
                     ui.label(wizard.title).classes("text-subtitle2")
                     ui.label(wizard.purpose).classes("text-caption")
-                    button = ui.button("Open", on_click=partial(desk.go, f"wizard/{wizard.command}"))
+                    button = ui.button("Open", on_click=partial(desk.go, f"wizard/{wizard.name}"))
                     button.props(f'flat aria-label="Open: {wizard.title}"')
 
 
@@ -115,7 +115,7 @@ def build_wizard(desk: Desk, wizard: Wizard) -> None:
         ui.button("Start", on_click=lambda: start(record=False)).props('icon="play_arrow"')
     if reason:
         ui.label(reason).classes("setup-text")
-    job_view(desk, wizard.command, early=wizard.command == "capture")
+    job_view(desk, wizard.name, early=wizard.name == "capture")
     if wizard.master != "none":
         previews(desk)
 
@@ -123,10 +123,8 @@ def build_wizard(desk: Desk, wizard: Wizard) -> None:
 def _form(wizard: Wizard) -> dict[str, Value]:
     """Show the options of a wizard's command; the values hold what is entered."""
     fields = {field.name: field for field in fields_of(CALIBRATIONS[wizard.command])}
-    pages = {"board", "cube"}  # their file is the page's own
-    hidden = FILLED | {"out"} if wizard.command in pages else FILLED
     first = [fields.pop(name) for name in wizard.first]
-    rest = [field for field in fields.values() if field.name not in hidden]
+    rest = [field for field in fields.values() if field.name not in FILLED | set(wizard.fixed)]
     values = {field.name: wizard.defaults.get(field.name, field.default) for field in (*first, *rest)}
     for field in first:
         _entry(field, values)

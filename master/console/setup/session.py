@@ -293,7 +293,7 @@ class Session:
         """
         with self._lock:
             self._refuse_busy()
-            work = self._work(wizard.command)
+            work = self._work(wizard.name)
             stages: list[Callable[[], Stage]] = []
             self._bring_back = (bool(self.cameras_running), self.master is not None)
             if record:
@@ -302,7 +302,7 @@ class Session:
             live = wizard.live and not any(
                 values.get(name) for name in ("source", "recording", "poses", "motion")
             )
-            line = self.commands.calibrate(wizard.command, values, work, live=live)
+            line = self.commands.calibrate(wizard.command, {**values, **wizard.fixed}, work, live=live)
             if wizard.master == "run" and live and self.master is None and not self.foreign_master:
                 self.start_master()
             keyed = wizard.master != "none"
@@ -310,7 +310,7 @@ class Session:
                 self.show(wizard.scene)
             name = MASTER if wizard.master == "capture" and (live or not wizard.live) else "calibrate"
             stages.append(lambda: Stage(wizard.title, {name: line}, wizard.keyboard and live))
-            return self._begin(wizard.command, wizard.title, stages, work, keyed=keyed)
+            return self._begin(wizard.name, wizard.title, stages, work, keyed=keyed)
 
     def use(self, job: Job) -> tuple[Path, ...]:
         """Write a job's results into the tree; a master that met cameras then tracks.

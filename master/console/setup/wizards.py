@@ -28,7 +28,7 @@ class Wizard:
     """One calibration as a page leads through it.
 
     Attributes:
-        command: Last word of the command of `phalanx calibrate`.
+        name: Its name in the addresses of the page.
         purpose: What is better afterwards.
         needs, steps: What must be there before, and what the person does.
         master: Which master runs meanwhile: none is needed, it is the master itself, or one that tracks.
@@ -39,9 +39,11 @@ class Wizard:
         prepared: Whose recording it needs: the marker cameras', that of a wrist device; "" for none.
         scene: What simulated cameras show meanwhile.
         seconds: How long a recording is made.
+        of: Last word of the command of `phalanx calibrate`, where it is not `name`.
+        fixed: Options of that command that make it this calibration; not in the form.
     """
 
-    command: str
+    name: str
     title: str
     purpose: str
     needs: str
@@ -54,6 +56,13 @@ class Wizard:
     prepared: Prepared = ""
     scene: str = "standard"
     seconds: float = 0.0
+    of: str = ""
+    fixed: Mapping[str, Value] = field(default_factory=dict[str, Value])
+
+    @property
+    def command(self) -> str:
+        """Last word of its command, a key of `CALIBRATIONS`."""
+        return self.of or self.name
 
 
 _BOARD = ("board", "square_mm")
@@ -108,7 +117,7 @@ _MARKERS = (
         "What error of depth to expect at which distance, and what was measured, if there is a recording or a table.",
         "Lenses and places.",
         ("Start: nothing else is needed for what is to be expected.",),
-        first=("source", "sigma_px", "speed_m_s"),
+        first=("source", "sigma_px", "speed_m_s"), of="depth", fixed={"verify": True},
     ),
     Wizard(
         "time", "Lateness of cameras", "How much later a camera takes its frames than its stamps say.",
@@ -192,7 +201,7 @@ _OBJECTS = (
         "cube", "Box of tags to print", "A box of tags at true scale, and its object file.",
         "A printer, a box of that size.",
         ("Choose name and sides.", "Print at 100 %, measure the ruler.", "Glue it round the box."),
-        first=("name", "side_mm", "edge_mm"),
+        first=("name", "side_mm", "edge_mm"), of="board", fixed={"kind": "box"},
     ),
     Wizard(
         "tracker", "Tracking system (Vive)",
@@ -209,7 +218,7 @@ GROUPS: dict[str, tuple[Wizard, ...]] = {
     "Wrist device": _WRIST,
     "Objects": _OBJECTS,
 }
-WIZARDS: dict[str, Wizard] = {wizard.command: wizard for group in GROUPS.values() for wizard in group}
+WIZARDS: dict[str, Wizard] = {wizard.name: wizard for group in GROUPS.values() for wizard in group}
 
 
 def no_recording(plan: Plan, wizard: Wizard) -> str:

@@ -60,7 +60,7 @@ def test_a_stamp_that_lies_is_named_once_with_what_to_do(motion: Callable[[int],
     assert len(warnings) == 1
     assert "camera right: its frames are " in warnings[0]
     assert "later than its stamps say" in warnings[0]
-    assert "calibrate time" in warnings[0]
+    assert "calibrate cameras time" in warnings[0]
 
 
 @pytest.mark.parametrize("motion", [scenes.sideways, scenes.natural, scenes.circling, scenes.resting])

@@ -1,4 +1,4 @@
-"""`calibrate depth` and `calibrate verify` as a user calls them: tables in, laws in the rig file, refusals."""
+"""`calibrate depth` and `calibrate depth --verify` as a user calls them: tables in, laws in the rig file, refusals."""
 
 import json
 from pathlib import Path
@@ -190,7 +190,7 @@ def test_verify_names_the_option_that_is_wrong(
     tmp_path: Path, arguments: tuple[str, ...], words: str
 ) -> None:
     with pytest.raises(CalibrationError, match=words):
-        run("verify", "--rig", "desk", "--calibration", tree(tmp_path), *arguments)
+        run("depth", "--verify", "--rig", "desk", "--calibration", tree(tmp_path), *arguments)
 
 
 def test_laws_are_refused_for_three_cameras(tmp_path: Path) -> None:
@@ -203,7 +203,19 @@ def test_verify_measures_every_model_of_the_rig(tmp_path: Path) -> None:
     calib, numbers, picture = tree(tmp_path), tmp_path / "n.json", tmp_path / "p.png"
     csv = seen_by(calib, tmp_path / "s.csv")
     run("depth", csv, "--calibration", calib, "--rig", "desk", "--out", calib)
-    out = run("verify", csv, "--calibration", calib, "--rig", "desk", "--json", numbers, "--picture", picture)
+    out = run(
+        "depth",
+        "--verify",
+        csv,
+        "--calibration",
+        calib,
+        "--rig",
+        "desk",
+        "--json",
+        numbers,
+        "--picture",
+        picture,
+    )
     assert "fitted to this very sweep" in out
     assert "camera rate: left 60 Hz" in out
     assert "2 % at 1 m/s sideways needs exposures within 1.50 ms" in out
@@ -220,7 +232,8 @@ def test_the_predicted_error_off_the_axis_is_the_measured_one(tmp_path: Path) ->
     calib, numbers = tree(tmp_path), tmp_path / "n.json"
     run("depth", seen_by(calib, tmp_path / "s.csv"), "--calibration", calib, "--rig", "desk", "--out", calib)
     run(
-        "verify",
+        "depth",
+        "--verify",
         "--calibration",
         calib,
         "--rig",
@@ -236,7 +249,7 @@ def test_the_predicted_error_off_the_axis_is_the_measured_one(tmp_path: Path) ->
     off = tmp_path / "off.csv"
     lines = seen_by(calib, off, side_m=0.0375 + 0.5 * np.tan(np.radians(20.0))).read_text().splitlines()
     off.write_text("\n".join([lines[0], *(line for line in lines if line.startswith("0.500"))]) + "\n")
-    run("verify", off, "--calibration", calib, "--rig", "desk", "--json", numbers)
+    run("depth", "--verify", off, "--calibration", calib, "--rig", "desk", "--json", numbers)
     measured = json.loads(numbers.read_text())["rows"][0]
     assert measured["off_axis_deg"] == pytest.approx(20.0, abs=0.1)
     assert predicted[1][0] == pytest.approx(measured["error_percent"]["affine_disparity"], abs=0.01)
@@ -246,11 +259,19 @@ def test_the_predicted_error_off_the_axis_is_the_measured_one(tmp_path: Path) ->
 def test_verify_needs_something_to_verify(tmp_path: Path) -> None:
     csv = table(tmp_path / "s.csv")
     with pytest.raises(CalibrationError, match="nothing to verify"):
-        run("verify", csv)
+        run("depth", "--verify", csv)
     with pytest.raises(CalibrationError, match="v_left_px"):
-        run("verify", csv, "--calibration", tree(tmp_path), "--rig", "desk")
+        run("depth", "--verify", csv, "--calibration", tree(tmp_path), "--rig", "desk")
     with pytest.raises(CalibrationError, match="--sigma-px -1"):
-        run("verify", csv, "--sigma-px", "-1")
+        run("depth", "--verify", csv, "--sigma-px", "-1")
+
+
+def test_verify_writes_no_law(tmp_path: Path) -> None:
+    calib = tree(tmp_path)
+    with pytest.raises(CalibrationError, match="--out has no meaning with --verify"):
+        run("depth", table(tmp_path / "s.csv"), "--verify", "--calibration", calib, "--out", calib)
+    with pytest.raises(CalibrationError, match="--use has no meaning with --verify"):
+        run("depth", "--verify", "--calibration", calib, "--use", "stereo")
 
 
 def test_a_nominal_view_stands_in_for_intrinsics(tmp_path: Path) -> None:
@@ -261,9 +282,9 @@ def test_a_nominal_view_stands_in_for_intrinsics(tmp_path: Path) -> None:
         bare["intrinsics"] = None
         path.write_text(json.dumps(bare))
     numbers = tmp_path / "n.json"
-    out = run("verify", "--calibration", calib, "--rig", "desk")
+    out = run("depth", "--verify", "--calibration", calib, "--rig", "desk")
     assert "no budget" in out
-    run("verify", "--calibration", calib, "--rig", "desk", "--fov-deg", "62.5", "--json", numbers)
+    run("depth", "--verify", "--calibration", calib, "--rig", "desk", "--fov-deg", "62.5", "--json", numbers)
     rows = json.loads(numbers.read_text())["budget"]["rows"]
     # One pixel of disparity is 2.53 cm at 1 m and 0.63 cm at 50 cm (docs/theory/sources.md#pixel-of-disparity).
     assert rows[-1]["one_pixel_mm"] == pytest.approx(25.3, abs=0.05)
@@ -295,7 +316,8 @@ def test_a_law_without_depth_at_a_place_is_shown_as_such_and_the_means_are_of_th
     calib = tree(tmp_path, rig_file(affine_disparity=law))
     numbers = tmp_path / "n.json"
     out = run(
-        "verify", table(tmp_path / "s.csv"), "--calibration", calib, "--rig", "desk", "--json", numbers
+        "depth",
+        "--verify", table(tmp_path / "s.csv"), "--calibration", calib, "--rig", "desk", "--json", numbers
     )  # fmt: skip
     assert "nan" not in out
     found = json.loads(numbers.read_text(), parse_constant=pytest.fail)  # NaN is no JSON

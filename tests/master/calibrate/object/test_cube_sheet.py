@@ -11,6 +11,7 @@ from common.calibration.object_profile import ObjectProfile, tag_corners
 from common.errors import CalibrationError
 from common.geometry.tag_family import tag_image
 from master.calibrate.object.cube_sheet import TagBox, dark_squares, print_box
+from tests.cli import calibrate, invoke
 
 BOX = TagBox("box", "aruco_5x5_100", 3, 0.04, 0.03)
 
@@ -65,3 +66,17 @@ def test_what_cannot_be_printed_is_refused(tmp_path: Path) -> None:
         TagBox("box", "aruco_5x5_100", 0, 0.07, 0.03)
     with pytest.raises(CalibrationError, match="pdf"):
         print_box(tmp_path / "box.png", BOX)
+
+
+def test_the_command_prints_a_box_and_writes_its_object(tmp_path: Path) -> None:
+    page, tree = tmp_path / "mug.pdf", ("--calibration", tmp_path)
+    box = ("--kind", "box", "--name", "mug", "--side-mm", 50, "--edge-mm", 38, *tree, "-o", page)
+    assert "objects/mug.json" in calibrate("board", *box)
+    assert page.read_bytes().startswith(b"%PDF")
+    mug = parse((tmp_path / "objects/mug.json").read_bytes(), ObjectProfile, "mug")
+    assert mug == TagBox("mug", "aruco_5x5_100", 0, 0.05, 0.038).profile()
+    again = invoke("calibrate", "board", *box)
+    assert (again.exit_code, "not overwritten" in again.output) == (2, True)
+    for option, value in (("--board", "9x6"), ("--paper", "A3"), ("--square-mm", 20), ("--marker-mm", 15)):
+        refused = invoke("calibrate", "board", *box, option, value)
+        assert (refused.exit_code, f"{option}: is of a board" in refused.output) == (2, True)

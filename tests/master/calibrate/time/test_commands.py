@@ -1,4 +1,4 @@
-"""`calibrate time`: offsets of a recording to the rig file, refusals that say what to do, and the offset at work."""
+"""`calibrate cameras time`: offsets to the rig file, refusals that say what to do, and the offset at work."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -52,7 +52,7 @@ def write_recording(folder: Path, messages: list[MarkerDetections], *, continuou
 
 def run(*arguments: str | Path) -> tuple[int, str]:
     try:
-        result = invoke("calibrate", "time", *arguments)
+        result = invoke("calibrate", "cameras", "time", *arguments)
     except PhalanxError as error:
         return 1, str(error)
     return result.exit_code, result.output
@@ -112,7 +112,7 @@ def test_the_rig_file_gets_the_offset_with_its_source_and_keeps_the_rest(tmp_pat
     rig = load(out / "rigs" / "bench.json", RigCalibration)
     assert abs(rig.stamp_offset_us["right"] - 8000.0) < 300.0
     source = rig.provenance["stamp_offset_us"]
-    assert (source.tool, source.data) == ("calibrate time", ("swing",))
+    assert (source.tool, source.data) == ("calibrate cameras time", ("swing",))
     assert 0.0 < source.residual["right_sigma_us"] < 500.0
     assert msgspec.structs.replace(rig, stamp_offset_us=before.stamp_offset_us, provenance={}) == before
     assert msgspec.json.decode(numbers.read_bytes())["offset_us"]["right"] == rig.stamp_offset_us["right"]
