@@ -41,11 +41,9 @@ def add_demo(demo: ArgumentParser) -> None:
     )
     demo.add_argument("--json", type=Path, metavar="FILE", help="write the summary to FILE as well")
     demo.add_argument(
-        "--out", type=Path, default=Path("out/demo"), metavar="DIR", help="default: %(default)s"
+        "--out", type=Path, default=Path("out/demo"), metavar="DIR", help="results (default: %(default)s)"
     )
-    demo.add_argument(
-        "--calibration", type=Path, default=calibration_tree(), metavar="DIR", help="default: %(default)s"
-    )
+    _add_calibration(demo)
     _add_scene(demo)
 
 
@@ -85,9 +83,8 @@ def _add_scene(demo: ArgumentParser) -> None:
 def add_deploy(deploy: ArgumentParser) -> None:
     """Install a slave for each camera as a service of its machine.
 
-    Waits until it streams.
-
-    Goes back to what was before where it does not. Needs ssh and rsync here, ssh, Python 3.11 and systemd there.
+    Waits until it streams, and goes back to what was before where it does not. Needs ssh and rsync here, ssh, Python
+    3.11 and systemd there.
 
     Examples:
       phalanx fleet deploy pi-left.local pi-right.local --master 192.168.1.2
@@ -121,9 +118,7 @@ def add_deploy(deploy: ArgumentParser) -> None:
         deploy.add_argument(f"--{name}", action="append", default=[], metavar=metavar, help=what)
     deploy.add_argument("--imu", metavar="DRIVER", help="as `phalanx-slave run --imu` has it")
     deploy.add_argument("--lights", metavar="DRIVER", help="as `phalanx-slave run --lights` has it")
-    deploy.add_argument(
-        "--calibration", type=Path, default=calibration_tree(), metavar="DIR", help="default: %(default)s"
-    )
+    _add_calibration(deploy)
     keys = Path(os.environ.get("PHALANX_KEYS") or Path.home() / ".config/phalanx/keys")
     text = "keys folder; made if it is missing (default: %(default)s)"
     deploy.add_argument("--keys", type=Path, default=keys, metavar="DIR", help=text)
@@ -149,9 +144,9 @@ def add_deploy(deploy: ArgumentParser) -> None:
 
 
 def add_rollback(rollback: ArgumentParser) -> None:
-    """Roll back one step.
+    """Put machines back to what they had before the last deployment.
 
-    It waits until what was before is ready; the release that is left is removed.
+    It waits until their slaves are ready again, and removes the release that it left.
 
     Examples:
       phalanx fleet rollback pi-left.local pi-right.local
@@ -162,7 +157,7 @@ def add_rollback(rollback: ArgumentParser) -> None:
 
 
 def add_uninstall(uninstall: ArgumentParser) -> None:
-    """Leaves nothing of ours there.
+    """Remove slaves from their machines, with all that they brought.
 
     Examples:
       phalanx fleet uninstall pi-left.local pi-right.local
@@ -173,21 +168,21 @@ def add_uninstall(uninstall: ArgumentParser) -> None:
 
 
 def add_wheels(wheels: ArgumentParser) -> None:
-    """Downloads for another machine what a slave needs, and adds Phalanx itself.
+    """Download what a slave needs on another machine, and add Phalanx itself.
 
     Examples:
       phalanx fleet wheels wheels           for Raspberry Pi OS Trixie; then phalanx-slave install --wheelhouse wheels
       phalanx fleet wheels wheels --python 3.11 --with simplejpeg        for Bookworm, whose own was built for numpy 1
       phalanx fleet deploy HOST --master HOST --wheelhouse wheels           on a PC that has no network then
     """
-    wheels.add_argument("folder", type=Path, metavar="DIR", help="new or empty")
+    wheels.add_argument("folder", type=Path, metavar="DIR", help="new or empty folder for them")
     wheels.add_argument(
         "--machine", choices=("aarch64", "x86_64"), default="aarch64", help="default: %(default)s"
     )
     wheels.add_argument(
         "--python", default="3.13", metavar="VERSION", help="of that machine (default: %(default)s)"
     )
-    text = "one more; once for each"
+    text = "one package more; once for each"
     wheels.add_argument("--with", dest="more", action="append", default=[], metavar="REQUIREMENT", help=text)
 
 
@@ -197,6 +192,11 @@ def calibration_tree() -> Path:
     return here if here.is_dir() else Path(__file__).resolve().parent.parent / "calib_json"
 
 
+def _add_calibration(command: ArgumentParser) -> None:
+    text = "calib_json tree (default: %(default)s)"
+    command.add_argument("--calibration", type=Path, default=calibration_tree(), metavar="DIR", help=text)
+
+
 def _add_hosts(command: ArgumentParser) -> None:
     command.add_argument("hosts", nargs="+", metavar="HOST", help="by ssh")
     _reach(command)
@@ -204,9 +204,8 @@ def _add_hosts(command: ArgumentParser) -> None:
 
 def _reach(command: ArgumentParser) -> None:
     command.add_argument("--dry-run", action="store_true", help="write nothing, print what would be done")
-    command.add_argument(
-        "--deadline", type=_seconds, default=900.0, metavar="S", help="for all (default: %(default)g)"
-    )
+    text = "longest time for all machines (default: %(default)g)"
+    command.add_argument("--deadline", type=_seconds, default=900.0, metavar="S", help=text)
     command.add_argument("--user", metavar="USER", help="of ssh; root, or one with passwordless sudo")
     command.add_argument("--port", type=int, metavar="PORT", help="of ssh")
     command.add_argument("--identity", type=Path, metavar="FILE", help="private key of ssh")

@@ -114,23 +114,13 @@ def board(command: ArgumentParser) -> None:
     add_number(command, "--marker-mm", "MM", "side of a marker. Default: 3/4 square")
     add_dictionary(command)
     add_text(command, "--name", "NAME", "of a box: name of the object", default="box")
-    families = ("apriltag_16h5", "apriltag_25h9", "apriltag_36h11", "aruco_4x4_50", "aruco_5x5_100")
-    add_choice(
-        command,
-        "--family",
-        (*families, "aruco_6x6_250"),
-        "of a box: family of its tags",
-        default="aruco_5x5_100",
-    )
+    april, aruco = ("16h5", "25h9", "36h11"), ("aruco_4x4_50", "aruco_5x5_100", "aruco_6x6_250")
+    families = (*(f"apriltag_{bits}" for bits in april), *aruco)
+    add_choice(command, "--family", families, "of a box: family of its tags", default="aruco_5x5_100")
     add_number(command, "--first", "N", "of a box: number of its first tag", whole(), default=0)
     add_number(command, "--side-mm", "MM", "of a box: its side", default=40.0)
-    add_number(
-        command,
-        "--edge-mm",
-        "MM",
-        "of a box: edge of the black squares, as measured on the print",
-        default=30.0,
-    )
+    edge = "of a box: edge of the black squares, as measured on the print"
+    add_number(command, "--edge-mm", "MM", edge, default=30.0)
     add_calibration(command, "objects/, for the file of a box")
 
 
@@ -218,15 +208,12 @@ def depth(command: ArgumentParser) -> None:
     add_number(command, "--frames", "N", "with --live: frames to average, at least", whole(8), default=30)
     add_number(command, "--seconds", "S", "with --live: time to average", number(1.0, 60.0), default=1.0)
     add_flag(command, "--verify", "fit nothing: report how right the depth of the rig is")
-    sigma, apart = (
-        "noise of a centroid, one camera, per axis, in px",
-        "uncorrected time between the two exposures",
-    )
-    add_number(command, "--sigma-px", "N", f"with --verify: {sigma}", default=0.1)
-    add_number(
-        command, "--speed-m-s", "N", "with --verify: sideways speed for the budget, in m/s", default=1.0
-    )
-    add_number(command, "--skew-ms", "N", f"with --verify: {apart}, in ms", default=0.5)
+    sigma = "with --verify: noise of a centroid, one camera, per axis, in px"
+    speed = "with --verify: sideways speed for the budget, in m/s"
+    apart = "with --verify: uncorrected time between the two exposures, in ms"
+    add_number(command, "--sigma-px", "N", sigma, default=0.1)
+    add_number(command, "--speed-m-s", "N", speed, default=1.0)
+    add_number(command, "--skew-ms", "N", apart, default=0.5)
     angles = "with --verify: angles to the side, in degrees, for the off-axis table"
     add_text(command, "--angles", "ANGLES", angles, default="-20:20:10")
     add_link(command)

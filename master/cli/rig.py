@@ -82,7 +82,7 @@ def console(command: ArgumentParser) -> None:
 
 
 def check(command: ArgumentParser) -> None:
-    """Print what is not as it should be.
+    """List what is wrong with a running rig, and what to do.
 
     Exit code 1 if there is anything, 0 if all is well.
 
@@ -112,9 +112,8 @@ def info(command: ArgumentParser) -> None:
 def camera(command: ArgumentParser) -> None:
     """Show how a running camera is set, or set it otherwise.
 
-    At once, read back, compared.
-
-    What the camera does not take is refused by name, and it goes back to what it had.
+    A change is made at once, read back and compared. What the camera does not take is refused by name, and it goes
+    back to what it had.
 
     Examples:
       phalanx camera left
@@ -145,8 +144,7 @@ def camera(command: ArgumentParser) -> None:
 def gestures(command: ArgumentParser) -> None:
     """List the poses that a hand is known by, and what is asked of each.
 
-    Or teach one, forget one, or list which gestures
-    a recorded hand makes, from when to when.
+    Or teach one, forget one, or list which gestures a recorded hand makes, from when to when.
 
     To teach a pose, show it a few times before a running master, or give its time in a recorded run. The hand is
     known by it at once: a running master follows the file. A pose too similar to another is refused, and the
@@ -207,8 +205,7 @@ def gestures(command: ArgumentParser) -> None:
 def status(command: ArgumentParser) -> None:
     """Show each process of the rig: machine, version, temperature, clock, rate.
 
-    A row for each camera, IMU and tracker
-    that has keys or reports itself; a dash where nothing is known.
+    A row for each camera, IMU and tracker that has keys or reports itself; a dash where nothing is known.
 
     With --wait it waits until datagrams of these senders come: at the master that runs or, where none does, here; it
     ends with 1 if one of them is not received.

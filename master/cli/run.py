@@ -26,8 +26,7 @@ from master.commands.options import (
 def run(command: ArgumentParser) -> None:
     """Track live until Ctrl-C.
 
-    Hands, objects, contact and gestures go to the bus (phalanx/hand/<name>, .../object/...)
-    and, if asked, to files.
+    Hands, objects, contact and gestures go to the bus (phalanx/hand/<name>, .../object/...) and, if asked, to files.
 
     Several rigs of one hand are one hand: cameras that watch its markers and the device on its wrist are solved
     together. Rigs of two hands are two hands, each published under its own name. The files of rigs, cameras, hands,
@@ -193,8 +192,8 @@ def _how_it_is_solved(command: ArgumentParser) -> None:
 def record(command: ArgumentParser) -> None:
     """Record what a running master receives and solves, in one MCAP file.
 
-    The file carries the rig's calibration. A process of its own:
-    it waits for the master, goes on when that was started again, and never slows the tracking.
+    The file carries the rig's calibration. A process of its own: it waits for the master, goes on when that was started
+    again, and never slows the tracking.
 
     Ctrl-C ends the file. A disk that is full ends it too, with exit code 1; what was written is readable. A replay is
     what was solved live, bit for bit, where the master was started with `run --record FILE`; a recording that began
@@ -226,8 +225,8 @@ def record(command: ArgumentParser) -> None:
 def play(command: ArgumentParser) -> None:
     """Play a recording as if its master were live.
 
-    What the master received is solved again, with the files that it carries, and goes to the bus as
-    from a live master. At the end stands a SHA-256 of all poses: it is the same at any speed.
+    What the master received is solved again, with the files that it carries, and goes to the bus as from a live
+    master. At the end stands a SHA-256 of all poses: it is the same at any speed.
 
     While it plays, the bus answers the commands pause, resume, seek and speed. After a jump, and with --from, the two
     seconds before are solved silently, so that filters have settled; what follows is near to that of a whole pass,

@@ -9,6 +9,7 @@ from common.command_line import count, megabytes, number, port, positive
 from slave.drivers import CAMERAS, IMU_UNITS, IMUS, LIGHTS, REAL_IMUS, SCANS, SWITCHED_LIGHTS, TRACKERS
 
 BEACON_PORT = 47800
+_START = "UDP port of the master's start (default: %(default)s)"
 BOTH = "grasp | both-poses | both-curl | both-travel | both-moves | gestures"  # the same motion for both kinds of rig
 
 
@@ -24,7 +25,7 @@ def add_place(command: ArgumentParser, who: str, calibration: str = "calib_json"
 def add_link(command: ArgumentParser) -> None:
     """How it finds its master."""
     link = command.add_argument_group("master").add_argument
-    link("--beacon-port", type=port, default=BEACON_PORT, metavar="PORT", help="default: %(default)s")
+    link("--beacon-port", type=port, default=BEACON_PORT, metavar="PORT", help=_START)
     link("--bind", default="0.0.0.0", metavar="ADDRESS", help="own address (default: every network)")
     link(
         "--keys",
@@ -222,9 +223,8 @@ def _add_detection(command: ArgumentParser) -> None:
 def record(command: ArgumentParser) -> None:
     """Write raw frames of a camera to disk, and a real IMU beside it.
 
-    Without master or network: one folder per
-    camera. Or makes a recording of those of several cameras (--join), of videos or pictures that other programs made
-    (--from), or imu.csv of the table of an IMU (--imu-csv).
+    Without master or network: one folder per camera. Or makes a recording of those of several cameras (--join), of
+    videos or pictures that other programs made (--from), or imu.csv of the table of an IMU (--imu-csv).
 
     Examples:
       phalanx-slave record --name left --rig desk --camera synthetic --seconds 10 -o recordings/wave-left
@@ -312,13 +312,12 @@ def record(command: ArgumentParser) -> None:
 def colours(command: ArgumentParser) -> None:
     """Find the marker colours of a camera in a recording.
 
-    Writes its camera file, and reports what collides with
-    what.
+    Writes its camera file, and reports which markers and things look alike.
 
     Examples:
       phalanx-slave colours recordings/paints --camera left -o calib_json/cameras/left.json
             HSV ranges from one click per marker, or, without clicks, from a few seconds of the moving hand;
-            prints what collides with what
+            prints which markers and things look alike
       phalanx-slave colours left.mp4 --camera left --calibration calib_json -o calib_json/cameras/left.json \\
           --click thumb=312,204 --click index=350,122 --click middle=371,101 --click ring=395,117 \\
           --click little=420,150 --click back=360,260
@@ -333,7 +332,7 @@ def colours(command: ArgumentParser) -> None:
         help="folder; with clicks in recording.json, or a few seconds of the moving, open hand; or a video or a folder "
         "of pictures, with --calibration",
     )
-    command.add_argument("--camera", required=True, metavar="NAME")
+    command.add_argument("--camera", required=True, metavar="NAME", help="camera of the recording")
     command.add_argument(
         "--click",
         action="append",
@@ -374,10 +373,10 @@ def click(text: str) -> tuple[str, tuple[float, float]]:
 
 
 def doctor(command: ArgumentParser) -> None:
-    """Report what of this device is well and what is not.
+    """Check this device: a line each of what is well, and of what is not.
 
-    Machine, clock, libraries, keys, devices, camera, service, and
-    whether its master is received; each line ok, warn or fail, with what mends it; exit 1 where something fails.
+    Machine, clock, libraries, keys, devices, camera, service, and whether its master is received; each line ok, warn or
+    fail, with what mends it; exit 1 where something fails.
 
     With --lights it looks at laser and LEDs of a wrist device alone: what the strobe of a rig may do, and what share of
     every limit for eyes and supply that is; and switches them, if asked to.
@@ -407,9 +406,7 @@ def doctor(command: ArgumentParser) -> None:
     command.add_argument("--calibration", type=Path, metavar="DIR", help=text)
     command.add_argument("--keys", type=Path, metavar="DIR", help="keys folder (default: /etc/phalanx/keys)")
     command.add_argument("--master", metavar="HOST", help="the PC whose beacon and clock are expected")
-    command.add_argument(
-        "--beacon-port", type=int, default=BEACON_PORT, metavar="PORT", help="default: %(default)s"
-    )
+    command.add_argument("--beacon-port", type=int, default=BEACON_PORT, metavar="PORT", help=_START)
     command.add_argument("--json", action="store_true", help="for programs")
     command.add_argument("--ports", action="store_true", help="list where an IMU may be connected, and end")
     lights = command.add_argument_group("laser and LEDs of a wrist device").add_argument

@@ -8,17 +8,17 @@ they are. It also sends what an IMU measures, and where a tracker is. Images lea
 request, while somebody looks.
 
   phalanx-slave run --name left --rig desk --camera picamera2 --keys keys
-  sudo phalanx-slave doctor           what of this device is well, and what is not"""
+  sudo phalanx-slave doctor           checks this device, line by line"""
 _TABLE = (
     Command("run", "run", "detect or measure live, and send",
             "slave.cli.options:run", "slave.commands.run:run"),
-    Command("record", "record", "raw frames to disk; or a recording of several, or of your own videos",
+    Command("record", "record", "write raw frames to disk, join recordings, or take your own videos",
             "slave.cli.options:record", "slave.commands.record:run"),
-    Command("colours", "set up", "colours of the markers of a camera, from a recording",
+    Command("colours", "set up", "find the marker colours of a camera in a recording",
             "slave.cli.options:colours", "slave.commands.offline:run"),
-    Command("doctor", "set up", "what of this device is well, and what is not; test of its lights",
+    Command("doctor", "set up", "check this device, and test its lights",
             "slave.cli.options:doctor", "slave.doctor.command:run"),
-    Command("install", "set up", "install it as a service of this machine",
+    Command("install", "set up", "install the slave as a service of this machine",
             "slave.install.arguments:add_install", "slave.install.command:run_here"),
 )  # fmt: skip
 PROGRAM = Program(

@@ -253,7 +253,7 @@ def _all_of(name: str, texts: Sequence[str], names: Sequence[str]) -> list[str]:
 
 
 def add_install(parser: argparse.ArgumentParser) -> None:
-    """Installs slaves as services of this machine, each with what it needs; as root.
+    """Install slaves as services of this machine, each with what it needs; as root.
 
     Examples:
       sudo phalanx-slave install --master 192.168.1.2 --rig desk --name left --keys keys --calibration calib_json

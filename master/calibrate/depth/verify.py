@@ -1,4 +1,4 @@
-"""`phalanx calibrate depth --verify`: measured depth errors against the error budget.
+"""`calibrate depth --verify`: measured depth errors against the error budget.
 
 It gives the published table of 20...100 cm for every depth model that the rig has, as lines, numbers and a plot. Three
 things stand side by side and must not be mixed: what a sweep *measured*, at the angles at which the target stood; what
