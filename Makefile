@@ -112,8 +112,8 @@ faults: $(STAMP) ## every fault on real processes: what is expected, what is mea
 hostile: $(STAMP) ## stolen devices say what they like to a running master; HOSTILE_ARGS='--messages 20000' for less
 	@$(BIN)/python -m bench hostile $(HOSTILE_ARGS)
 
-audit: $(STAMP) ## known vulnerabilities of all that is locked; AUDIT_ARGS='--sbom out/sbom.json' writes what is in it
-	@$(BIN)/python -m bench audit $(AUDIT_ARGS)
+audit: $(STAMP) ## known vulnerabilities of all that is locked; AUDIT_ARGS='-f cyclonedx-json -o sbom.json' writes what is in it
+	@$(BIN)/python -m pip_audit -r constraints.txt --disable-pip --no-deps --strict --progress-spinner off $(AUDIT_ARGS)
 
 instructions: $(STAMP) ## aarch64 instructions of the slave per frame, against the record; needs mmdebstrap and gcc
 	@$(BIN)/python -m bench instructions $(INSTRUCTIONS_ARGS)

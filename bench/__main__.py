@@ -72,7 +72,6 @@ COMMANDS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "guards": {
         "oracle": ("oracle.command", "frozen recordings with exact truth; one solver against another"),
-        "audit": ("audit", "known vulnerabilities of all locked packages"),
     },
 }
 ALL = {name: entry for group in COMMANDS.values() for name, entry in group.items()}

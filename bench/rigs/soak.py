@@ -19,7 +19,7 @@ import numpy as np
 from bench.report import machine
 from bench.rigs.local import Rig, cpu_s, losses
 from bench.rigs.rooms import slower
-from bench.rigs.soak_verdict import Finding, Mapping, Minute, SoakHistory, grown, judge, mapped
+from bench.rigs.soak_verdict import Finding, Minute, SoakHistory, judge
 from common.calibration.files import replacing
 from common.messages import HandPose, Health
 from common.messages.streams import MASTER
@@ -60,7 +60,7 @@ class SoakRig(Rig):
             raise
         self.course = SoakHistory(footprints={name: [] for name in self.processes})
         self._start_s = time.monotonic()
-        self._since_s, self._cpu_s, self._mapped = 0.0, self._spent_s(), self._maps()
+        self._since_s, self._cpu_s = 0.0, self._spent_s()
 
     @property
     def now_s(self) -> float:
@@ -82,7 +82,7 @@ class SoakRig(Rig):
         with self._lock:
             latency_ms, health = self._latency_ms, dict(self._health)
             self._latency_ms = []
-        now_s, spent_s, maps = self.now_s, self._spent_s(), self._maps()
+        now_s, spent_s = self.now_s, self._spent_s()
         took = now_s - self._since_s
         p50, p99 = np.percentile(latency_ms, [50, 99]) if latency_ms else (np.nan, np.nan)
         metrics = health[MASTER].metrics if MASTER in health else {}
@@ -90,11 +90,10 @@ class SoakRig(Rig):
         figures = (len(latency_ms) / took, float(p50), float(p99), os.getloadavg()[0], cores, losses(health))
         end = ".clock_offset_us"
         clocks = {name.removesuffix(end): us for name, us in metrics.items() if name.endswith(end)}
-        more = {name: grown(self._mapped[name], now) for name, now in maps.items()}
-        minute = Minute(now_s, *figures, clocks, {name: mb for name, mb in more.items() if mb})
+        minute = Minute(now_s, *figures, clocks)
         self.course.minutes.append(minute)
         self.course.counts = {name: dict(one.counts) for name, one in health.items()}
-        self._since_s, self._cpu_s, self._mapped = now_s, spent_s, maps
+        self._since_s, self._cpu_s = now_s, spent_s
         return minute
 
     def _keep(self, message: object) -> None:
@@ -106,9 +105,6 @@ class SoakRig(Rig):
 
     def _spent_s(self) -> dict[str, float]:
         return {name: cpu_s(one.pid) for name, one in self.processes.items()}
-
-    def _maps(self) -> dict[str, list[Mapping]]:
-        return {name: mapped(one.pid) for name, one in self.processes.items()}
 
 
 def _run(options: argparse.Namespace, stop: threading.Event) -> tuple[SoakHistory, list[str]]:

@@ -2,14 +2,12 @@
 
 Slopes are those of Theil and Sen (median of the slopes of all pairs, P. K. Sen 1968), with Sen's interval of 95 %,
 widened where what is left is correlated. Of latency the quietest minute of every five is judged: a process that keeps
-more and more raises the least, too. Memory that rises at once and stays is hardly seen by a slope: steps are found for
-themselves, and the mapping of the process in which they came.
+more and more raises the least, too.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from math import nan, sqrt
-from pathlib import Path
 from statistics import NormalDist
 
 import numpy as np
@@ -23,7 +21,6 @@ GROWS_MS, GROWS_SHARE = 1.0, 0.05
 BLOCK_S = 60.0
 LEAST_S = 600.0  # after the warm-up; a shorter run cannot tell 1 MB/h from the last arenas that are filled
 _FEWEST = 4
-STEP_MB = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +35,6 @@ class Minute:
     cores: dict[str, float]  # process -> processor time in seconds a second
     counts: dict[str, int]  # of the master since the start: lost, skipped, dropped, refused, blocked
     clock_offset_us: dict[str, float]  # sender -> by how much its clock is ahead of the master's
-    grown: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
 
 
 @dataclass(slots=True)
@@ -63,77 +59,6 @@ class SoakHistory:
             "minutes": [asdict(one) for one in self.minutes],
             "counts": self.counts,
         }
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """A rise of resident memory: minute in which it came, and how much [MB = 1e6 bytes]."""
-
-    minute: int
-    mb: float
-
-
-@dataclass(frozen=True, slots=True)
-class Mapping:
-    """Addresses from `start` to before `end`, `ADDRESS NAME`, and how much of it is resident [MB]."""
-
-    start: int
-    end: int
-    name: str
-    mb: float
-
-
-def steps_of(times_s: Sequence[float] | Float, mb: Sequence[float] | Float) -> list[Step] | None:
-    """Return rises of more than `STEP_MB` from the median of one minute to that of the next; None: too short.
-
-    Of readings `mb` (N,) at times (N,) [s]. Rises in minutes that follow each other are one step. In the first minute
-    files are read and tables filled: the second is held against the most that it had.
-    """
-    times, values = np.asarray(times_s, np.float64), np.asarray(mb, np.float64)
-    block = (times // BLOCK_S).astype(np.int64)
-    minutes = [int(k) for k in np.unique(block)]
-    if len(minutes) < 3:
-        return None
-    medians = [float(np.median(values[block == k])) for k in minutes]
-    medians[0] = float(values[block == minutes[0]].max())
-    found: list[Step] = []
-    for minute, before, after in zip(minutes[1:], medians, medians[1:], strict=False):
-        rise = after - before
-        if rise <= STEP_MB:
-            continue
-        if found and minute == found[-1].minute + 1:
-            found[-1] = Step(minute, found[-1].mb + rise)
-        else:
-            found.append(Step(minute, rise))
-    return found
-
-
-def mapped(pid: int) -> list[Mapping]:
-    """Return what a process has mapped, and how much of each is resident."""
-    found: list[Mapping] = []
-    for line in Path(f"/proc/{pid}/smaps").read_text().splitlines():
-        first, _, rest = line.partition(" ")
-        if not first.endswith(":"):  # a mapping begins: addresses, rights, offset, device, inode, name
-            start, _, end = first.partition("-")
-            fields = rest.split(maxsplit=4)
-            name = Path(fields[4]).name if len(fields) > 4 else "anonymous"
-            found.append(Mapping(int(start, 16), int(end, 16), f"{start} {name}", 0.0))
-        elif first == "Rss:":
-            found[-1] = replace(found[-1], mb=float(rest.split()[0]) * 1024 * 1e-6)
-    return found
-
-
-def grown(before: Sequence[Mapping], after: Sequence[Mapping]) -> dict[str, float]:
-    """Return mapping -> by how much it has grown [MB], the largest first; those that grew by little are left out.
-
-    The kernel joins neighbours and grows them at either end: a mapping is held against all that lay where it lies.
-    """
-    more = {
-        one.name: one.mb - sum(old.mb for old in before if old.start < one.end and one.start < old.end)
-        for one in after
-    }
-    kept = sorted((one for one in more.items() if one[1] > 0.5), key=lambda one: -one[1])
-    return dict(kept[:3])
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,30 +133,12 @@ def judge(course: SoakHistory, ended: Sequence[str]) -> list[Finding]:
             value = f"{found.per_h:+.2f} MB/h ({found.low:+.2f} ... {found.high:+.2f})"
             ok = found.per_h <= mb_per_h
         findings.append(Finding(f"memory of {process}", value, f"{mb_per_h:g} MB/h", ok))
-    findings += [_steps(course, process) for process in course.footprints]
     findings += [_latency(course.minutes, name) for name in ("p50", "p99")]
     counts = course.minutes[-1].counts if course.minutes else {}
     for what in ("lost", "dropped", "refused", "blocked"):
         gone = counts.get(what, 0)
         findings.append(Finding(what, str(gone), "0", gone == 0 if counts else None))
     return findings
-
-
-def _steps(course: SoakHistory, process: str) -> Finding:
-    found, what = steps_of(course.times_s, course.series(process, "rss_mb")), f"steps of {process}"
-    limit = f"none of {STEP_MB:g} MB"
-    if found is None:
-        return Finding(what, "too short to say", limit, None)
-    where = "; ".join(_where(course, process, step) for step in found)
-    return Finding(what, where or "none", limit, not found)
-
-
-def _where(course: SoakHistory, process: str, step: Step) -> str:
-    """Return by how much, when, and where: what grew in that minute or the one before, for a median is late."""
-    near = [one for one in course.minutes if step.minute - 1 <= one.t_s // BLOCK_S - 1 <= step.minute]
-    where = [f"{name} +{mb:.1f}" for one in near for name, mb in one.grown.get(process, {}).items()]
-    places = ", ".join(where) or "mapping not known"
-    return f"+{step.mb:.1f} MB in minute {step.minute} ({places})"
 
 
 def _latency(minutes: Sequence[Minute], name: str) -> Finding:

@@ -10,16 +10,12 @@ import pytest
 
 from bench.rigs.local import Footprint, footprint, losses
 from bench.rigs.soak_verdict import (
-    Mapping,
     Minute,
     SoakHistory,
-    grown,
     judge,
     latency_slope,
-    mapped,
     memory_slope,
     slope,
-    steps_of,
 )
 from common.messages import Health
 
@@ -100,43 +96,6 @@ def test_the_counts_of_all_processes_are_summed_by_what_they_mean() -> None:
     assert losses({"master": master, "left": left}) == expected
 
 
-def stepped(at_s: float, mb: float, length_s: float = 1200.0) -> SoakHistory:
-    """A process that leaks nothing, and one buffer that comes late, in two halves."""
-    made = history(0.0, length_s)
-    times = np.array(made.times_s)
-    more = 0.5 * mb * ((times >= at_s).astype(float) + (times >= at_s + 5.0))
-    mbs = np.array(made.series("master", "rss_mb")) + more
-    made.footprints["master"] = [Footprint(x, x, 0.0) for x in mbs.tolist()]
-    return made
-
-
-@pytest.mark.parametrize("at_s", [250.0, 380.0, 598.0, 717.0])
-def test_a_step_is_found_in_the_minute_in_which_it_came(at_s: float) -> None:
-    made = stepped(at_s, 34.0)
-    (found,) = steps_of(made.times_s, made.series("master", "rss_mb")) or []
-    assert found.mb == pytest.approx(34.0, abs=1.5)
-    assert abs(60.0 * found.minute - at_s) <= 60.0
-
-
-def test_a_step_after_the_start_is_no_pass_though_the_trend_leaves_it_out() -> None:
-    output = verdict(stepped(66.0, 34.0))
-    assert output["memory of master"] is True
-    assert output["steps of master"] is False
-
-
-def test_a_leak_noise_and_a_process_that_settles_are_no_steps() -> None:
-    for per_h in (0.0, 3.0, 30.0):
-        assert verdict(history(per_h))["steps of master"] is True
-    assert verdict(history(0.0, 120.0))["steps of master"] is None
-
-
-def test_a_step_says_which_mapping_grew() -> None:
-    made = stepped(380.0, 34.0)
-    made.minutes[6].grown["master"] = {"7f0040000000 anonymous": 33.5}
-    (line,) = (one.value for one in judge(made, []) if one.what == "steps of master")
-    assert line.endswith("MB in minute 6 (7f0040000000 anonymous +33.5)")
-
-
 @contextmanager
 def fresh_pages(size: int) -> Generator[None]:
     """Pages of the kernel, in use: an array might get what this process freed before, and leave what it frees."""
@@ -144,21 +103,6 @@ def fresh_pages(size: int) -> Generator[None]:
         for place in range(0, size, mmap.PAGESIZE):
             kept[place] = 1
         yield
-
-
-def test_the_mapping_that_grew_is_reported_by_the_kernel() -> None:
-    before = mapped(os.getpid())
-    with fresh_pages(32_000_000):
-        more = grown(before, mapped(os.getpid()))
-    assert max(more.values()) == pytest.approx(32.0, abs=3.0)
-    assert next(iter(more)).endswith("anonymous")
-
-
-def test_a_mapping_that_joined_its_neighbour_has_grown_by_what_is_new() -> None:
-    heap = Mapping(0x1000, 0x2000, "1000 [heap]", 5.0)
-    before = [heap, Mapping(0x9000, 0xA000, "9000 anonymous", 20.0)]
-    after = [heap, Mapping(0x7000, 0xA000, "7000 anonymous", 52.0)]
-    assert grown(before, after) == {"7000 anonymous": 32.0}
 
 
 def test_memory_of_a_process_is_read_as_the_kernel_has_it() -> None:
