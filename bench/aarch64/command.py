@@ -1,8 +1,7 @@
 """Aarch64 instructions of the slave per frame, against the record (`make instructions`).
 
     python -m bench instructions                  every case
-    python -m bench instructions six lost         some of: step six twelve lost windows search numba numba-windows
-                                                  wrist wrist-numba seed
+    python -m bench instructions six windows      some of: six windows numba numba-windows wrist wrist-numba seed
     python -m bench instructions --record         every case, and what was counted is the new baseline
 
 Exit code: 0 within the gate, 1 outside it or detected otherwise than on this machine, 2 cannot be counted here.
@@ -75,12 +74,8 @@ def other_versions(new: dict[str, str], old: dict[str, str]) -> list[str]:
 
 
 CASES = {
-    "step": "whole step, six markers: detect, message, encode, seal",
     "six": "detection, six markers",
-    "twelve": "detection, twelve markers",
-    "lost": "detection, six markers, all sought anew in every frame",
     "windows": "detection in windows alone, six markers",
-    "search": "the same, one of them lost: a strip in every frame",
     "numba": "detection, six markers, by machine code",
     "numba-windows": "the same in windows alone",
     "wrist": "triple of a wrist device: strobe, seams, laser, tips, message",
@@ -90,11 +85,8 @@ CASES = {
 RATIOS = (
     ("seed", "six", "published / ours"),
     ("six", "windows", "whole frame / windows"),
-    ("search", "six", "windows and one marker lost / whole frame"),
     ("wrist", "wrist-numba", "wrist, numpy / machine code"),
     ("numba", "numba-windows", "whole frame / windows, machine code"),
-    ("twelve", "six", "12 markers / 6 markers"),
-    ("lost", "six", "every marker sought anew / tracked"),
 )
 
 

@@ -9,10 +9,10 @@ import msgspec
 import numpy as np
 
 from common.arrays import Image
-from common.calibration import CameraCalibration, HandProfile, HsvRange, RigCalibration, load
+from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 
 FRAME_NS = 16_666_667
-SIX, TWELVE, WRIST = "six", "twelve", "wrist"
+SIX, WRIST = "six", "wrist"
 
 
 class MarkedFrames(NamedTuple):
@@ -31,13 +31,6 @@ def forth_and_back(k: int, count: int) -> int:
     """Index of step `k` along `count` >= 2 items that are walked forth and back; the period is 2 (count - 1)."""
     period = 2 * (count - 1)
     return min(k % period, period - k % period)
-
-
-def without(frames: MarkedFrames, name: str) -> MarkedFrames:
-    """The same frames for a detector that seeks the marker `name` in a colour that none of them shows."""
-    nowhere = HsvRange(hsv_low=(0, 255, 255), hsv_high=(1, 255, 255))
-    ranges = {**(frames.camera.markers or {}), name: nowhere}
-    return frames._replace(camera=msgspec.structs.replace(frames.camera, markers=ranges))
 
 
 class StrobedFrames(NamedTuple):

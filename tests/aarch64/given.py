@@ -14,7 +14,7 @@ CYCLES = 3  # getting into step may take one or two
 
 def write(folder: Path) -> bytes:
     """Fill `folder`; return what the sealed datagrams say."""
-    frames.write(folder / frames.SIX, scene.rendered()[frames.SIX])
+    frames.write(folder / frames.SIX, scene.rendered())
     lit = strobed("curl", CYCLES)
     np.savez(
         folder / "wrist.npz",
