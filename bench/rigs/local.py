@@ -46,15 +46,13 @@ def free_port(kind: int) -> int:
     raise OSError(f"of {tries} ports from {_PORTS.start} to {_PORTS.stop - 1} none was free")
 
 
-def join_bus(
-    endpoint: str, patience_s: float, environment: Mapping[str, str] = os.environ, site: str | None = None
-) -> ZenohBus:
+def join_bus(endpoint: str, patience_s: float, environment: Mapping[str, str] = os.environ) -> ZenohBus:
     """Join the bus of a master that is about to listen at `endpoint`; BusError: it did not within `patience_s`."""
     deadline = time.monotonic() + patience_s
     while True:
         try:
             access = access_of(environment, OPERATOR)
-            return ZenohBus(None, endpoint, access, beyond=True, namespace=site)
+            return ZenohBus(None, endpoint, access, beyond=True)
         except BusError:
             if time.monotonic() > deadline:
                 raise

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bench.rigs.rooms import ROOM, detections, dome, room
-from bench.rigs.scale import ScaleRun, cost_per_camera, into_page, summary
+from bench.rigs.scale import ScaleRun, into_page, summary
 from master.rig.setup import load_setup
 
 PAGE = Path(__file__).parents[2] / "docs" / "scale.html"
@@ -17,8 +17,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "scale.html"
 def run(cameras: int, pose_ms: float = 6.0, message_ms: float = 0.2) -> ScaleRun:
     cores = 90.0 * (pose_ms + cameras * message_ms) * 1e-3
     return ScaleRun(
-        ROOM, cameras, 1, 90.0, 10.0, 900 * cameras, 900 * cameras, 0, 0, 0, 0, 0, 0, 90.0, 5.0, 9.0, cores,
-        5000.0, 2.0,
+        cameras, 90.0, 10.0, 900 * cameras, 900 * cameras, 0, 0, 0, 0, 0, 0, 90.0, 5.0, 9.0, cores, 5000.0, 2.0,
     )  # fmt: skip
 
 
@@ -39,35 +38,30 @@ def test_the_cameras_of_a_room_all_see_the_hand(tmp_path: Path, cameras: int) ->
 
 
 def test_the_model_is_the_line_through_the_runs() -> None:
-    model = summary([run(2), run(4), run(16)], {})["model"]
+    model = summary([run(2), run(4), run(16)])["model"]
     assert model["pose_ms"] == pytest.approx(6.0, abs=1e-3)
     assert model["message_ms"] == pytest.approx(0.2, abs=1e-4)
     assert model["off_line_percent"] == pytest.approx(0.0, abs=0.1)
 
 
-def test_what_a_hand_costs_is_no_cost_of_a_camera() -> None:
-    stages = {"hand": 3000.0, "filter": 100.0, "gestures": 900.0, "frame_sync": 500.0}
-    assert cost_per_camera(run(4), stages) == pytest.approx((90.0 * 6.8 - 90.0 * 4.0) * 1e-3 / 4)
-
-
 def test_the_page_takes_what_was_measured_and_has_all_that_it_computes_with(tmp_path: Path) -> None:
     page = tmp_path / "scale.html"
     page.write_text(PAGE.read_text())
-    into_page(page, summary([run(2), run(16)], {}))
+    into_page(page, summary([run(2), run(16)]))
     block = re.search(r'id="measured">\n(.*?)\n</script>', page.read_text(), re.DOTALL)
     assert block is not None
     used = set(re.findall(r"model\.(\w+)", PAGE.read_text()))
-    assert used <= set(json.loads(block[1])["model"]) | {"hop_p50_ms", "hop_p99_ms"}
+    assert used <= set(json.loads(block[1])["model"])
     page.write_text("<html></html>")
     with pytest.raises(ValueError, match="found 0"):
         into_page(page, {})
 
 
-def test_the_page_that_is_shipped_has_measured_figures_of_both_layouts() -> None:
+def test_the_page_that_is_shipped_has_measured_figures() -> None:
     block = re.search(r'id="measured">\n(.*?)\n</script>', PAGE.read_text(), re.DOTALL)
     assert block is not None
     found = json.loads(block[1])
-    assert {"pose_ms", "message_ms", "hop_p50_ms", "datagram_bytes"} <= set(found["model"])
-    assert {one["layout"] for one in found["runs"].values()} == {"room", "building"}
+    assert {"pose_ms", "message_ms", "datagram_bytes"} <= set(found["model"])
+    assert set(found["runs"]) == {"2", "4", "8", "16"}
     assert "http://" not in PAGE.read_text()
     assert "https://" not in PAGE.read_text()
