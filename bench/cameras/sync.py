@@ -1,30 +1,27 @@
 """Depth of a moving hand from unsynchronised cameras: errors by rate, offset, motion and treatment.
 
-First exact projections, row by row: the desk's cameras (75 mm apart, 497 px, lenses that distort), the second late by
+Exact projections, row by row: the desk's cameras (75 mm apart, 497 px, lenses that distort), the second late by
 any offset; a marker is seen when its own row is exposed, as the mean over the exposure, with noise. What `FrameSync`
-and `triangulate` make of the messages is held against the exact place, over many seeds. Then rendered frames through
-the real detector and the whole pipeline. Baseline: frames paired by their number.
+and `triangulate` make of the messages is held against the exact place, over many seeds. Baseline: frames paired by
+their number.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Literal
 
 import msgspec
 import numpy as np
 
-from bench.played import START_NS, Trajectory, Watched, solve, watch
-from bench.report import CALIBRATION, Row, chi_squares, inside, rig_files
+from bench.played import START_NS
+from bench.report import CALIBRATION, Row, chi_squares, inside
 from common.arrays import Bool, Float
 from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections
-from common.sim.motion import REST, HandState, angles_of, base_pose
-from common.sim.scene import Scene, view_centre
 from master.estimator.sensors import CameraArrays
 from master.fabrik.intersection import triangulate
 from master.fabrik.sync import FrameSet, FrameSync
-from master.rig.setup import RigSetup, load_setup
+from master.rig.setup import load_setup
 
 DEPTH_M, SPEED_M_S = 0.5, 1.0
 MARKERS = 24
@@ -216,7 +213,6 @@ _OFFSETS_MS = (0.0, 2.0, 4.2, 6.2, 8.3, 10.4, 12.5, 16.7)
 _POLICIES: tuple[Treatment, ...] = ("interpolate", "predict")
 _SEEDS = range(2)
 _GOAL = 2.0  # %
-_AMPLITUDE_M = 0.15  # of the rendered swing
 
 
 def rows() -> Iterator[Row]:
@@ -236,20 +232,6 @@ def rows() -> Iterator[Row]:
             found = outcome(MOTIONS[motion], shooting, "interpolate", range(30))
             name = f"60 Hz, {motion}, stamps wrong by {t_sigma_ms} ms (sd): 95 % cover"
             yield Row(name, found.covered, "%", "goal 90 to 98")
-    for exposures in ((0.015, 0.015), (0.002, 0.015)):
-        found = outcome(
-            MOTIONS["swing 10 cm"], Shooting(60.0, 8.3e-3, exposure_s=exposures), "interpolate", _SEEDS
-        )
-        name = f"60 Hz, swing 10 cm, exposures {1e3 * exposures[0]:.0f} and {1e3 * exposures[1]:.0f} ms"
-        yield _errors(name, [found], f"goal {_GOAL:g}")
-    for rate in RATES_HZ:
-        for treatment in ("uncorrected", *_POLICIES):
-            errors = [np.abs(rendered(rate, 1e-3 * ms, treatment)) for ms in (0.0, 8.3, 16.7)]
-            p95 = [float(np.percentile(one, 95)) for one in errors]
-            every = np.concatenate(errors)
-            note = f"median {np.median(every):.2f}, max {every.max():.2f}; p95 at 0, 8.3, 16.7 ms"
-            name = f"{rate:.0f} Hz, rendered hand swinging 15 cm, {treatment}: p95"
-            yield Row(name, max(p95), "%", f"{note} {' '.join(f'{value:.2f}' for value in p95)}")
 
 
 def _at_offsets(motion: str, rate_hz: float, treatment: Treatment, seeds: range = _SEEDS) -> list[Outcome]:
@@ -279,54 +261,6 @@ def _errors(name: str, found: Sequence[Outcome], note: str) -> Row:
     by_offset = " ".join(f"{value:.2f}" for value in p95)
     spread = f"median {np.median(every):.2f}, max {every.max():.2f}"
     return Row(f"{name}: p95", max(p95), "%", f"{spread}; {note}; p95 by offset {by_offset}")
-
-
-def _swing(setup: RigSetup) -> Trajectory:
-    """The resting posture moved along x; the speed at the middle is SPEED_M_S."""
-    angles = angles_of(setup.hand, np.array(REST, np.float64), np.zeros((5, 4)))
-
-    def where(t_s: float) -> HandState:
-        shift = np.array([_AMPLITUDE_M * np.sin(SPEED_M_S / _AMPLITUDE_M * t_s), 0.0, 0.0])
-        return HandState(base_pose(setup.hand, view_centre(setup.rig), shift, np.zeros(3)), angles)
-
-    return Trajectory(where, 2.0 * np.pi * _AMPLITUDE_M / SPEED_M_S)
-
-
-@cache
-def _scene(rate_hz: float) -> tuple[RigSetup, Scene]:
-    setup = load_setup(CALIBRATION, "desk")
-    cameras = {n: msgspec.structs.replace(c, frame_rate_hz=rate_hz) for n, c in setup.cameras.items()}
-    scene = Scene.of_motion(setup.rig, cameras, rig_files("desk")[2], _swing(setup))
-    return replace(setup, cameras=cameras), scene
-
-
-@cache
-def _detected(rate_hz: float, offset_s: float) -> tuple[Watched, ...]:
-    setup, scene = _scene(rate_hz)
-    times = np.arange(round(0.9 * rate_hz)) / rate_hz
-    return tuple(watch(scene, name, times + c * offset_s) for c, name in enumerate(setup.rig.cameras))
-
-
-def rendered(rate_hz: float, offset_s: float, treatment: Treatment) -> Float:
-    """Return errors of depth [%] of all caps of a rendered swing at all moments, before the filter."""
-    setup, scene = _scene(rate_hz)
-    watched = _detected(rate_hz, offset_s)
-    if treatment == "predict":
-        setup = replace(setup, rig=msgspec.structs.replace(setup.rig, frame_sync="predict"))
-    if treatment == "uncorrected":  # the k-th frame with the k-th of the other camera
-        watched = tuple(
-            replace(one, messages=tuple(_by_number(m, rate_hz) for m in one.messages)) for one in watched
-        )
-        models: dict[str, CameraModel] = {n: replace(m, row_time_ns=0.0) for n, m in setup.models.items()}
-        setup = replace(setup, models=models)
-    errors: list[Float] = []
-    for pose in solve(setup, watched)[0]:
-        t_s = (pose.t_ns - START_NS) * 1e-9
-        if t_s > 0.25:  # until then the detector has no tracks
-            truth = scene.truth(t_s).markers_m[:, 2]
-            error = 100.0 * (pose.markers_raw_m[:, 2] - truth) / truth
-            errors.append(error[np.isfinite(error)])
-    return np.concatenate(errors)
 
 
 def _by_number(message: MarkerDetections, rate_hz: float) -> MarkerDetections:
