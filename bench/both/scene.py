@@ -81,31 +81,20 @@ class Both:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Visibility:
-    """What is truly in sight, frame by frame."""
+    """What of the markers is truly in sight, frame by frame."""
 
     visible_t_s: Mapping[str, Float]  # camera -> (T,) scene times [s] of its frames
     visible_px2: Mapping[str, Float]  # camera -> (T, M) visible area of every marker [px^2]
-    line_t_s: Float  # (K,) scene times [s] of the wrist device's triples
-    line_m: Float  # (K, 5) length of the laser line on each finger that is lit and seen [m]
-    tip: Bool  # (K, 5) whether each fingertip is in sight of the wrist camera
 
     def cameras_of(self, t_s: Float, within_s: float) -> Int:
         """(N, M) how many cameras have each marker (9 px^2) in sight within so long of the moments (N,) [s]."""
         count = np.zeros((len(t_s), next(iter(self.visible_px2.values())).shape[1]), np.int64)
         for name, times in self.visible_t_s.items():
-            count += _about(t_s, times, self.visible_px2[name] >= 9.0, within_s)
+            seen = self.visible_px2[name] >= 9.0
+            total = np.concatenate([np.zeros((1, seen.shape[1]), np.int64), np.cumsum(seen, axis=0)])
+            first, last = (np.searchsorted(times, t_s + way * within_s) for way in (-1.0, 1.0))
+            count += total[last] > total[first]
         return count
-
-    def worn(self, t_s: Float, within_s: float) -> Bool:
-        """(N, 5) whether the wrist device has 2 mm of laser line, or the tip, of each finger in sight."""
-        return _about(t_s, self.line_t_s, (self.line_m >= 2e-3) | self.tip, within_s)
-
-
-def _about(t_s: Float, times_s: Float, there: Bool, within_s: float) -> Bool:
-    """(N, ...) whether something is there (T, ...) at any of the times (T,) within so long of the moments (N,)."""
-    first, last = (np.searchsorted(times_s, t_s + way * within_s) for way in (-1.0, 1.0))
-    total = np.concatenate([np.zeros((1, *there.shape[1:]), np.int64), np.cumsum(there, axis=0)])
-    return np.asarray(total[last] > total[first])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,9 +157,8 @@ def shown_of(both: Both, seconds: float, every: int = 1) -> Shown:
         found, paint[camera] = markers_shown(both.scene, camera, times[camera], 1.0 / rate, both.seed)
         messages += found
     frame_s = 1.0 / both.wrist.cameras[both.wrist.rig.cameras[0]].frame_rate_hz
-    line_t = np.arange(1.0, seconds / frame_s - 1.0, 3.0) * frame_s
-    cycles, line, tip = _cycles(both, line_t, frame_s)
-    return Shown(both, seconds, in_order(messages + cycles), Visibility(times, paint, line_t, line, tip))
+    cycles = _cycles(both, np.arange(1.0, seconds / frame_s - 1.0, 3.0) * frame_s, frame_s)
+    return Shown(both, seconds, in_order(messages + cycles), Visibility(times, paint))
 
 
 def markers_shown(
@@ -214,19 +202,15 @@ def _marker_message(
     return MarkerDetections(camera, 1, seq, t_ns, t_ns, uv, area, quality, sigma, np.full_like(uv, np.nan))
 
 
-def _cycles(both: Both, times_s: Float, frame_s: float) -> tuple[list[Observed], Float, Bool]:
-    """The triples with laser frames at these times, and of line [m] and tips (K, 5) what is in sight."""
+def _cycles(both: Both, times_s: Float, frame_s: float) -> list[Observed]:
+    """The triples with laser frames at these times."""
     report = _WristErrors(both, 3.0 * frame_s)
     out: list[Observed] = []
-    lines: list[Float] = []
-    tips: list[Bool] = []
     for k, t in enumerate(times_s.tolist()):
         laser, led = both.wrist_scene.truth(t), both.wrist_scene.truth(t + frame_s)
-        lines.append(laser.laser_len_vis[1:6])
-        tips.append(led.tip_visible)
         t_ns = START_NS + round(t * 1e9)
         out.append(report(3 * k + 1, t_ns, t_ns + round(frame_s * 1e9), laser, led))
-    return out, np.array(lines), np.array(tips)
+    return out
 
 
 class _WristErrors:
@@ -292,24 +276,16 @@ def watched(both: Both, seconds: float) -> Shown:
         found = list(observed(both.scene, camera, times[camera]))
         paint[camera] = np.array([_paint(view) for _, view, _ in found])
         messages += [message for message, _, _ in found]
-    cycles, line_t, line, tip = cycles_of(both, seconds)
-    return Shown(both, seconds, in_order(messages + cycles), Visibility(times, paint, line_t, line, tip))
+    return Shown(both, seconds, in_order(messages + cycles_of(both, seconds)), Visibility(times, paint))
 
 
-def cycles_of(both: Both, seconds: float) -> tuple[list[Observed], Float, Float, Bool]:
-    """The wrist device's triples; when its laser frames were, what of line [m] and tips (K, 5) was in sight."""
+def cycles_of(both: Both, seconds: float) -> list[Observed]:
+    """The wrist device's triples, rendered and detected."""
     name = both.wrist.rig.cameras[0]
     own = both.wrist.cameras[name]
     detector = WristDetector(WristView.of(both.wrist.rig, own, both.wrist.hand.profile), own.frame_rate_hz)
-    out: list[Observed] = []
-    times: list[float] = []
-    for frame in _frames(both, name, seconds):
-        if (found := detector.push(frame)) is not None:
-            out.append(found.message(name, session=1))
-            times.append(1e-9 * (found.cycle.laser.t_ns - START_NS))
-    truths = [(both.wrist_scene.truth(t), both.wrist_scene.truth(t + 1.0 / own.frame_rate_hz)) for t in times]
-    line = np.array([laser.laser_len_vis[1:6] for laser, _ in truths])
-    return out, np.array(times), line, np.array([led.tip_visible for _, led in truths])
+    found = [detector.push(frame) for frame in _frames(both, name, seconds)]
+    return [one.message(name, session=1) for one in found if one is not None]
 
 
 def _frames(both: Both, name: str, seconds: float) -> Iterator[Frame]:

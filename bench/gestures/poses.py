@@ -147,7 +147,7 @@ def _by_both(number: int) -> dict[str, RecognisedPoses]:
     alone = _known(marked, who)
     both = Both("both-poses", seed, scene, device, alone, RigSetup.of(file, worn.cameras, alone.hand))
     markers = _detected(scene)
-    messages = in_order([*markers, *orientations(both, _SECONDS), *cycles_of(both, _SECONDS)[0]])
+    messages = in_order([*markers, *orientations(both, _SECONDS), *cycles_of(both, _SECONDS)])
     return {
         "desk-back3": _found(alone, markers, posed),
         "desk-back3 + wrist-back3": _found(both.fused, messages, posed),

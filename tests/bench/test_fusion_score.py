@@ -1,14 +1,14 @@
-"""What the section fusion counts, on hands worked out by hand: errors, steps, bits, sight."""
+"""What the section fusion counts, on hands worked out by hand: errors, bits, sight."""
 
 import numpy as np
 import pytest
 
-from bench.both.fusion import Figures, VisibleAt, ratios
-from bench.both.scene import Both, Shown, Solved, Visibility
+from bench.both.fusion import Figures, ratios
+from bench.both.scene import Both, Solved, Visibility
 from bench.played import START_NS
 from common.arrays import Float
 from common.geometry.transforms import matrix_to_quaternion
-from common.hand.model import CHAINS, TIPS, WRIST
+from common.hand.model import TIPS, WRIST
 from common.messages import HandPose, Source
 
 BOTH = Both.of("both-poses", 3)
@@ -52,54 +52,39 @@ def solved(**changes: Float) -> Solved:
     return Solved.of(BOTH, poses(**changes), BOTH.fused)
 
 
-def shown(visible_area: float = 100.0, line: float = 0.02) -> Shown:
-    """So much paint of every marker in both cameras, and so much line on every finger, at all times."""
+def shown(visible_area: float = 100.0) -> Visibility:
+    """So much paint of every marker in both cameras at all times."""
     times = np.arange(0.0, 6.0, 1.0 / HZ)
     cameras = BOTH.markers.rig.cameras
-    visibility = Visibility(
-        dict.fromkeys(cameras, times),
-        {name: np.full((len(times), 6), visible_area) for name in cameras},
-        times,
-        np.full((len(times), 5), line),
-        np.zeros((len(times), 5), np.bool_),
-    )
-    return Shown(BOTH, 6.0, [], visibility)
-
-
-def figures(one: Solved, of: Shown) -> Figures:
-    return Figures.of(one, VisibleAt.of(of, one))
+    areas = {name: np.full((len(times), 6), visible_area) for name in cameras}
+    return Visibility(dict.fromkeys(cameras, times), areas)
 
 
 def test_a_hand_without_error_has_none_and_every_bit_is_true() -> None:
-    got = figures(solved(), shown())
+    got = Figures.of(solved(), shown())
     assert got.joint_mm == pytest.approx(0.0, abs=1e-6)
     assert got.four_deg == pytest.approx(0.0, abs=1e-6)
     assert got.fingers_mm == pytest.approx(0.0, abs=1e-6)
     assert (got.valid, got.tracked, got.inside, got.false_tracked) == (1.0, 1.0, 1.0, 0.0)
-    assert got.step_mm == pytest.approx(0.0, abs=1e-6)
-    assert got.hz == pytest.approx(HZ)
 
 
-def test_a_shift_of_the_hand_is_no_error_of_its_fingers_and_one_step() -> None:
+def test_a_shift_of_the_hand_is_no_error_of_its_fingers() -> None:
     off = np.zeros((COUNT, 26, 3))
     off[60:, :, 0] = 0.006
-    got = figures(solved(off_m=off), shown())
+    got = Figures.of(solved(off_m=off), shown())
     assert got.joint_mm == pytest.approx(3.0)
     assert got.fingers_mm == pytest.approx(0.0, abs=1e-6)
-    assert got.step_mm == pytest.approx(6.0)
-    assert got.over_step == pytest.approx(60.0 / (T_S[-1] - T_S[0]))
     assert got.inside == pytest.approx(0.5)  # 6 mm where 1 mm is claimed
     assert got.false_tracked == 0.0  # 20 mm are meant
 
 
-def test_a_joint_that_is_not_valid_has_neither_error_nor_step_nor_region() -> None:
+def test_a_joint_that_is_not_valid_has_neither_error_nor_region() -> None:
     off, valid = np.zeros((COUNT, 26, 3)), np.ones((COUNT, 26))
     tip = TIPS[INDEX]
     off[60:62, tip, 1] = 0.5
     valid[60:62, tip] = 0.0
-    got = figures(solved(off_m=off, valid=valid), shown())
+    got = Figures.of(solved(off_m=off, valid=valid), shown())
     assert got.joint_mm == pytest.approx(0.0, abs=1e-6)
-    assert got.step_mm == pytest.approx(0.0, abs=1e-6)
     assert got.inside == 1.0
     assert got.valid == pytest.approx(1.0 - 2.0 / (25 * COUNT))
 
@@ -107,30 +92,8 @@ def test_a_joint_that_is_not_valid_has_neither_error_nor_step_nor_region() -> No
 def test_a_tracked_bit_is_false_where_the_joint_is_far_off() -> None:
     off = np.zeros((COUNT, 26, 3))
     off[10:22, TIPS[INDEX], 2] = 0.021
-    got = figures(solved(off_m=off), shown())
+    got = Figures.of(solved(off_m=off), shown())
     assert got.false_tracked == pytest.approx(12 / COUNT)
-    assert got.off == pytest.approx(12 / (26 * COUNT))
-    assert got.unseen == 0.0
-
-
-@pytest.mark.parametrize(
-    ("visible_area", "line", "false"), [(0.0, 0.02, 1.0), (100.0, 0.0, 0.0), (0.0, 0.0, 1.0)]
-)
-def test_a_tracked_bit_is_false_where_nothing_measures_the_joint(
-    visible_area: float, line: float, false: float
-) -> None:
-    got = figures(solved(), shown(visible_area, line))  # without paint nothing tells where the palm is
-    assert got.false_tracked == false
-    palm_apart = np.ones((COUNT, 26))
-    palm_apart[:, np.setdiff1d(np.arange(26), CHAINS)] = 0.0
-    fingers = figures(solved(tracked=palm_apart), shown(visible_area, line))
-    assert fingers.unseen == (1.0 if visible_area == line == 0.0 else 0.0)
-
-
-def test_markers_alone_do_not_see_what_the_wrist_device_sees() -> None:
-    alone = Solved.of(BOTH, poses(), BOTH.markers)
-    assert figures(alone, shown(visible_area=0.0)).unseen == 1.0
-    assert figures(alone, shown(line=0.0)).unseen == 0.0
 
 
 def test_a_wrist_device_s_hand_is_put_where_it_truly_is() -> None:
@@ -139,8 +102,6 @@ def test_a_wrist_device_s_hand_is_put_where_it_truly_is() -> None:
     elsewhere = [_moved(pose, R_extra, np.array([0.3, -0.1, 0.2])) for pose in moved]
     alone = Solved.of(BOTH, elsewhere, BOTH.wrist)
     assert np.nanmax(alone.off_mm) == pytest.approx(0.0, abs=1e-6)
-    strapped = figures(alone, shown(visible_area=0.0))
-    assert strapped.false_tracked == 0.0  # its palm is where the strap has it
 
 
 def _moved(pose: HandPose, R_extra: Float, shift: Float) -> HandPose:
@@ -155,22 +116,11 @@ def _moved(pose: HandPose, R_extra: Float, shift: Float) -> HandPose:
 
 
 def test_a_finger_is_in_sight_around_the_frame_that_shows_it() -> None:
-    both = shown(visible_area=0.0, line=0.0)
+    both = shown(visible_area=0.0)
     name = BOTH.markers.rig.cameras[0]
-    both.visibility.visible_px2[name][120, INDEX] = 50.0  # at 2 s
-    seen = both.visibility.cameras_of(np.array([1.94, 1.97, 2.0, 2.03, 2.06]), 0.04)[:, INDEX]
+    both.visible_px2[name][120, INDEX] = 50.0  # at 2 s
+    seen = both.cameras_of(np.array([1.94, 1.97, 2.0, 2.03, 2.06]), 0.04)[:, INDEX]
     assert seen.tolist() == [0, 1, 1, 1, 0]
-
-
-def test_hand_overs_are_where_sight_changes() -> None:
-    both = shown()
-    for name in BOTH.markers.rig.cameras:
-        both.visibility.visible_px2[name][180:, INDEX] = 0.0  # from 3 s on
-    visible_at = VisibleAt.of(both, solved())
-    near = visible_at.hand_over[:, INDEX]
-    assert near[np.abs(T_S - 3.04) < 0.45].all()
-    assert not near[np.abs(T_S - 3.04) > 0.55].any()
-    assert not visible_at.hand_over[:, 2].any()
 
 
 def test_ratios_compare_what_both_call_valid() -> None:
