@@ -107,10 +107,10 @@ scale: $(STAMP) ## what 2 to 16 simulated cameras cost, what is lost, how late p
 	@$(BIN)/python -m bench scale --page docs/scale.html $(SCALE_ARGS)
 
 faults: $(STAMP) ## every fault on real processes: what is expected, what is measured; FAULTS_ARGS='--runs 1'
-	@$(BIN)/python -m bench faults $(FAULTS_ARGS)
+	@$(BIN)/python -m tests.faults.links $(FAULTS_ARGS)
 
 hostile: $(STAMP) ## stolen devices say what they like to a running master; HOSTILE_ARGS='--messages 20000' for less
-	@$(BIN)/python -m bench hostile $(HOSTILE_ARGS)
+	@$(BIN)/python -m tests.faults.hostile $(HOSTILE_ARGS)
 
 audit: $(STAMP) ## known vulnerabilities of all that is locked; AUDIT_ARGS='-f cyclonedx-json -o sbom.json' writes what is in it
 	@$(BIN)/python -m pip_audit -r constraints.txt --disable-pip --no-deps --strict --progress-spinner off $(AUDIT_ARGS)

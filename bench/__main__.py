@@ -65,8 +65,6 @@ COMMANDS: dict[str, dict[str, tuple[str, str]]] = {
         ),
     },
     "processes": {
-        "faults": ("rigs.faults", "faults of links, clocks, processes and cameras"),
-        "hostile": ("rigs.hostile", "stolen devices attack a running master"),
         "scale": ("rigs.scale", "2 to 16 cameras: cost, loss, latency"),
         "soak": ("rigs.soak", "an hour of a whole rig: memory, latency, loss"),
     },

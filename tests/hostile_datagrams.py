@@ -13,11 +13,11 @@ from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 
-from bench.rigs.faults import FaultRig, Judged
 from common.link.datagram import HEADER, MAGIC, MAX_DATAGRAM, Address, Kind
 from common.link.handshake import RigKeys
 from common.messages import WIRE_VERSION
 from common.messages.streams import MASTER
+from tests.faults.links import FaultRig, Judged
 
 _HELLO = bytes.fromhex("16030100c8010000c40303")  # how a TLS client begins
 _UPGRADE = (

@@ -5,9 +5,9 @@ from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from bench.rigs.hostile import STOLEN, HostileRig, Phase
-from bench.rigs.hostile_sender import HostileSender
 from master.rig.setup import load_setup
+from tests.faults.hostile import STOLEN, HostileRig, Phase
+from tests.faults.hostile_sender import HostileSender
 from tests.network_helpers import PATIENCE_S, until
 
 LOST = 0.75  # a master that stands still loses all, a machine with other things to do some; the bench measures how many

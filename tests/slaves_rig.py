@@ -10,10 +10,10 @@ from typing import Any
 
 from bench.report import CALIBRATION
 from bench.rigs.local import UP_S, Rig, RigError, until
-from bench.rigs.relay import UdpRelay
 from common.errors import BusError
 from common.messages import Checklist
 from common.messages.streams import MASTER
+from tests.faults.relay import UdpRelay
 
 MARKER_HZ, WRIST_HZ = 12.0, 30.0  # slow enough for two busy cores to draw all pictures in time
 _BEGIN_S = 4.0

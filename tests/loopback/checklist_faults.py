@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench.rigs.local import Lag, until
-from bench.rigs.relay import Impairment
 from common.messages import CheckCode
+from tests.faults.relay import Impairment
 from tests.slaves_rig import Key, SlavesRig, measured, read, write
 
 WAIT_S, AFTER_S = 30.0, 2.5  # for a line of the list; for what follows from a fault

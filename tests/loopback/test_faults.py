@@ -1,6 +1,6 @@
 """Faults on real processes, each once: steady and right poses again within two seconds of its end, counted, none false.
 
-`python -m bench faults` brings all of them about, several times, and prints the table of docs/faults.md: the goal is
+`make faults` brings all of them about, several times, and prints the table of docs/faults.md: the goal is
 judged there. Here are those that no test of the link alone can show, on a machine that may have other things to do, by
 the same measure.
 """
@@ -10,8 +10,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from bench.rigs.faults import LEAST_HZ, Fault, FaultRig, Pace, Run, cut, measured, of_links
 from bench.rigs.local import UP_S, until
+from tests.faults.links import LEAST_HZ, Fault, FaultRig, Pace, Run, cut, measured, of_links
 from tests.hostile_datagrams import Capture, assault, flood, hostile, targets
 
 FAULTS = {fault.name: fault for fault in of_links(seconds=1.5)}

@@ -1,7 +1,7 @@
 """Whoever has a device's own key says what he likes to a real master: it goes on, and so do all others.
 
 One hand before two honest cameras; a third camera of it, a tracker, and a second hand's wrist device are stolen
-(`bench.rigs.hostile`). `python -m bench hostile` is the same with many times as many messages. Then
+(`tests.faults.hostile`). `make hostile` is the same with many times as many messages. Then
 what a device reports on the bus, and what it asks there: nobody's terminal, report or master suffers.
 """
 
@@ -17,8 +17,6 @@ import msgspec
 import pytest
 import zenoh
 
-from bench.rigs.hostile import ROOT, STOLEN, HostileRig, Limits, all_attacked, row
-from bench.rigs.hostile_sender import raw_bus
 from bench.rigs.rooms import ROOM
 from common.link.handshake import EchoAnswer
 from common.messages import (
@@ -28,6 +26,8 @@ from common.messages import (
     TagDetections,
     encode,
 )
+from tests.faults.hostile import ROOT, STOLEN, HostileRig, Limits, all_attacked, row
+from tests.faults.hostile_sender import raw_bus
 from tests.hostile_rigs import (
     LEAST,
     MARKERS,

@@ -13,9 +13,6 @@ import numpy as np
 import pytest
 from msgspec import Struct
 
-from bench.rigs.fuzz import Attack, all_attacks
-from bench.rigs.hostile import HAND, HONEST, RATE_HZ, STOLEN, WRIST_RIG, scratch_tree
-from bench.rigs.hostile_sender import Speaker, own_kinds
 from bench.rigs.rooms import ROOM, detections
 from common.link.datagram import MAX_DATAGRAM, OVERHEAD, Kind, Refusal
 from common.link.handshake import EchoAnswer, Started
@@ -35,6 +32,9 @@ from master.run.dispatcher import new_dispatcher
 from master.run.link import MasterLink
 from master.run.link_senders import SensorMessage, limits_of
 from slave.link import SlaveLink
+from tests.faults.fuzz import Attack, all_attacks
+from tests.faults.hostile import HAND, HONEST, RATE_HZ, STOLEN, WRIST_RIG, scratch_tree
+from tests.faults.hostile_sender import Speaker, own_kinds
 from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Wires
 from tests.network_helpers import seeded
 

@@ -6,12 +6,12 @@ from contextlib import ExitStack
 
 import pytest
 
-from bench.rigs.relay import Impairment, UdpRelay
 from common.clock import Clock, SkewedClock, SystemClock
 from common.link.clock_offset import ClockEstimate
 from common.messages import MarkerDetections
 from master.run.ingest import Ingest
 from slave.uplink import Uplink
+from tests.faults.relay import Impairment, UdpRelay
 from tests.network_helpers import PATIENCE_S, detections, free_udp_port, until
 
 KEY = bytes(range(32))

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from bench.report import ROOT
-from bench.rigs.faults import FaultRig
 from bench.rigs.local import end, free_port, until
+from tests.faults.links import FaultRig
 from tests.hostile_datagrams import Capture, Watch, assault, flood, hostile, memory_mb, targets
 from tests.nightly import wall_clock
 from tests.programs import needs

@@ -9,6 +9,7 @@ import argparse
 import os
 import signal
 import statistics
+import sys
 import tempfile
 import threading
 import time
@@ -20,13 +21,13 @@ from pathlib import Path
 import numpy as np
 
 from bench.rigs.local import UP_S, Lag, Rig, RigError, until
-from bench.rigs.relay import Impairment, UdpRelay
 from bench.rigs.rooms import DESK, slower, standard_scene
 from bench.rigs.sender import WAY_S, scene_s
 from common.arrays import Float
 from common.errors import BusError
 from common.messages import WIRE_VERSION, Checklist, HandPose
 from common.messages.streams import MASTER
+from tests.faults.relay import Impairment, UdpRelay
 
 _GRID_HZ = 200.0
 _GAP_S = 0.2
@@ -427,9 +428,9 @@ def row(fault: Fault, runs: Sequence[Run]) -> str:
     )
 
 
-def main(arguments: Sequence[str]) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Bring all about, print the table; 1 if one is not as expected, 2 if this machine can show nothing."""
-    parser = argparse.ArgumentParser("python -m bench faults", description=__doc__)
+    parser = argparse.ArgumentParser("make faults", description=__doc__)
     parser.add_argument("--runs", type=int, default=3, metavar="N", help="of each fault (default: 3)")
     options = parser.parse_args(arguments)
     wrong = False
@@ -449,3 +450,7 @@ def main(arguments: Sequence[str]) -> int:
         finally:
             rig.close()
     return int(wrong)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -2,7 +2,7 @@
 
 It has its own key and a session as any other, and sends any message in it, and on the bus what devices publish there.
 
-`python -m bench.rigs.hostile_sender NAME TREE RIG BEACON_PORT BUS COUNT PER_S SEED`, BUS the endpoint of the master's
+`python -m tests.faults.hostile_sender NAME TREE RIG BEACON_PORT BUS COUNT PER_S SEED`, BUS the endpoint of the master's
 bus, the rig key in PHALANX_RIG_KEY. It prints `ready` when it has a session, waits for a line, sends COUNT messages,
 and prints how many of each type as JSON.
 """
@@ -21,7 +21,6 @@ import numpy as np
 import zenoh
 from msgspec import Struct
 
-from bench.rigs.fuzz import MESSAGE_TYPES, Attack, Fields, flood, wire
 from bench.rigs.rooms import detections
 from common.arrays import Float
 from common.bus.keys import rig_key
@@ -52,6 +51,7 @@ from common.messages.streams import key_of
 from common.sim.wrist.scene import WristScene
 from master.rig.setup import RigSetup, load_setup
 from slave.uplink import Uplink
+from tests.faults.fuzz import MESSAGE_TYPES, Attack, Fields, flood, wire
 
 _JPEG = cv2.imencode(".jpg", np.full((16, 16, 3), 90, np.uint8))[1].tobytes()
 _UNIT = np.array([1.0, 0.0, 0.0, 0.0])
@@ -184,7 +184,7 @@ class HostileUplink(Uplink):
     def notify(self, kind: Kind, body: bytes) -> bool:
         """Send a body in the session; False: there is none, or it does not fit."""
         with self._lock:
-            session = self._link._session  # pyright: ignore[reportPrivateUsage]
+            session = self._link._session
             if session is None or len(body) > MAX_DATAGRAM - OVERHEAD:
                 return False
             return self._data.send(session.sealer.seal(kind, body), session.address)
@@ -192,13 +192,13 @@ class HostileUplink(Uplink):
     def throw(self, datagram: bytes) -> bool:
         """Send a datagram as it is to the master."""
         with self._lock:
-            session = self._link._session  # pyright: ignore[reportPrivateUsage]
+            session = self._link._session
             return session is not None and self._data.send(datagram, session.address)
 
     @property
     def master(self) -> tuple[bytes, Address] | None:
         """The nonce and the address of the master, or None without a session."""
-        session = self._link._session  # pyright: ignore[reportPrivateUsage]
+        session = self._link._session
         return None if session is None else (session.master_nonce, session.address)
 
 

@@ -2,7 +2,7 @@
 
 One hand before three cameras, of which two are honest; an object with a tracker; a second hand with a wrist device that
 has a camera and an IMU. A phase without attack, then each stolen device in turn sends its share of hostile messages of
-every kind (`bench.rigs.fuzz`). Prints a table; ends with 1 where a limit is broken.
+every kind (`tests.faults.fuzz`). Prints a table; ends with 1 where a limit is broken.
 """
 
 import argparse
@@ -132,7 +132,7 @@ class HostileRig(Rig):
         place = [name, str(self.tree), STOLEN[name], str(self.beacon_port), self.endpoint]
         attack = [str(count), str(per_s), str(seed)]
         return subprocess.Popen(
-            [sys.executable, "-m", "bench.rigs.hostile_sender", *place, *attack],
+            [sys.executable, "-m", "tests.faults.hostile_sender", *place, *attack],
             cwd=ROOT, env=self.environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
 
@@ -327,9 +327,9 @@ def all_attacked(
     return outcomes
 
 
-def main(arguments: Sequence[str]) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Attack, print the table; 1 if a limit is broken."""
-    parser = argparse.ArgumentParser("python -m bench hostile", description=__doc__)
+    parser = argparse.ArgumentParser("make hostile", description=__doc__)
     parser.add_argument("--messages", type=int, default=200_000, metavar="N", help="of all devices (200000)")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="phalanx-hostile-") as folder:
@@ -343,3 +343,7 @@ def main(arguments: Sequence[str]) -> int:
         finally:
             rig.close()
     return int(len(outcomes) < len(STOLEN) or any(outcome.broken for outcome in outcomes))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

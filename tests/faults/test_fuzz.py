@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from msgspec import Meta, Struct
 
-from bench.rigs.fuzz import MESSAGE_TYPES, Attack, Now, all_attacks, attacks, flood
-from bench.rigs.hostile_sender import Speaker, examples
 from common.arrays import Float
 from common.errors import MessageError
 from common.link.datagram import Kind
 from common.link.handshake import EchoAnswer, Hello, Started, read
 from common.messages import Message, TrackerPose, decode, encode
 from common.messages.parts import Count, within
+from tests.faults.fuzz import MESSAGE_TYPES, Attack, Now, all_attacks, attacks, flood
+from tests.faults.hostile_sender import Speaker, examples
 
 MESSAGES = [kind for kind in MESSAGE_TYPES if issubclass(kind, Message)]
 SHAKES: dict[type[Struct], Kind] = {Hello: Kind.HELLO, Started: Kind.STARTED, EchoAnswer: Kind.ECHO_ANSWER}
