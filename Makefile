@@ -115,8 +115,8 @@ hostile: $(STAMP) ## stolen devices say what they like to a running master; HOST
 audit: $(STAMP) ## known vulnerabilities of all that is locked; AUDIT_ARGS='-f cyclonedx-json -o sbom.json' writes what is in it
 	@$(BIN)/python -m pip_audit -r constraints.txt --disable-pip --no-deps --strict --progress-spinner off $(AUDIT_ARGS)
 
-instructions: $(STAMP) ## aarch64 instructions of the slave per frame, against the record; needs mmdebstrap and gcc
-	@$(BIN)/python -m bench instructions $(INSTRUCTIONS_ARGS)
+instructions: $(STAMP) ## aarch64 instructions of the slave per frame, against the record; INSTRUCTIONS_ARGS=six for one case
+	@$(BIN)/python -m tests.aarch64.instructions $(INSTRUCTIONS_ARGS)
 
 schema: $(STAMP) ## write docs/schema/*.json afresh from the types
 	@$(BIN)/python -m tests.test_schemas

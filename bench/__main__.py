@@ -59,10 +59,6 @@ COMMANDS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "cost": {
         "pose_cost": ("pose_cost", "processor time of a pose, stage by stage; ends with a line of JSON"),
-        "instructions": (
-            "aarch64.command",
-            "aarch64 instructions of the slave per frame, against the record",
-        ),
     },
     "processes": {
         "scale": ("rigs.scale", "2 to 16 cameras: cost, loss, latency"),

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.aarch64 import frames, scene
+from tests.aarch64 import frames, scene
 from tests.aarch64.report import opened, others, sealed
 from tests.slave.wrist.wrist_frames import strobed
 

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import pytest
 
-from bench.aarch64 import sysroot
-from bench.aarch64.count import CPU, ONE_THREAD
-from bench.aarch64.sysroot import CACHE, PYTHON, ROOT, NoNetworkError, Sysroot
+from tests.aarch64 import sysroot
+from tests.aarch64.count import CPU, ONE_THREAD
+from tests.aarch64.sysroot import CACHE, PYTHON, ROOT, NoNetworkError, Sysroot
 
 
 class Guest(NamedTuple):

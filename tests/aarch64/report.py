@@ -18,8 +18,6 @@ import numpy as np
 
 import common
 import slave
-from bench.aarch64.frames import FRAME_NS, SIX, read
-from bench.aarch64.guest import Digest, arrays_of
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.errors import PhalanxError
 from common.link.datagram import Kind, Opener, Sealer, parse
@@ -30,6 +28,8 @@ from slave.markers.detector import MarkerDetector
 from slave.sources import Frame
 from slave.wrist.detector import WristDetector
 from slave.wrist.led_image import WristView
+from tests.aarch64.frames import FRAME_NS, SIX, read
+from tests.aarch64.guest import Digest, arrays_of
 
 CALIBRATION = Path(__file__).resolve().parents[2] / "calib_json"
 KEY = bytes(range(32))

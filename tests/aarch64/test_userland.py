@@ -1,6 +1,6 @@
 """The slave's programs on real aarch64 binaries, emulated: they import, and give the same bytes as on this machine.
 
-Times under emulation mean nothing and are never asserted; results are. tests/bench/test_aarch64.py counts there.
+Times under emulation mean nothing and are never asserted; results are. tests/aarch64/test_instructions.py counts there.
 """
 
 import hashlib

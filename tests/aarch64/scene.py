@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-from bench.aarch64.frames import SIX, WRIST, MarkedFrames, StrobedFrames, write, write_strobed
 from bench.report import rig_files
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from slave.cameras.synthetic import STROBE
+from tests.aarch64.frames import SIX, WRIST, MarkedFrames, StrobedFrames, write, write_strobed
 
 OPEN_S = 20.0  # an open hand: all six markers in view
 COUNT = 11  # forth and back a period of twenty frames

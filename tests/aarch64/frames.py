@@ -1,4 +1,4 @@
-"""The frames that are counted on, as files: written once by `bench.aarch64.scene`, read on both architectures."""
+"""The frames that are counted on, as files: written once by `tests.aarch64.scene`, read on both architectures."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.aarch64 import command, scene, sysroot
-from bench.aarch64.command import CASES, Baseline, BaselineError, main
-from bench.aarch64.count import FIRST, LAST, Counted, counted, native, slope
-from bench.aarch64.frames import FRAME_NS, SIX, WRIST, forth_and_back, read, read_strobed
-from bench.aarch64.guest import Digest, Marks, run_case
-from bench.aarch64.sysroot import NotPossibleError, Sysroot
 from slave.markers import detector
+from tests.aarch64 import instructions, scene, sysroot
+from tests.aarch64.count import FIRST, LAST, Counted, counted, native, slope
+from tests.aarch64.frames import FRAME_NS, SIX, WRIST, forth_and_back, read, read_strobed
+from tests.aarch64.guest import Digest, Marks, run_case
+from tests.aarch64.instructions import CASES, Baseline, BaselineError, main
 from tests.aarch64.machine import sysroot_or_skip
+from tests.aarch64.sysroot import NotPossibleError, Sysroot
 
 RECORD = Baseline("cortex-a53", {"six": 4_000_000}, {"numpy": "2.4.6", "qemu": "7.2"})
 
@@ -47,19 +47,19 @@ def test_the_slope_is_per_frame_and_blind_to_what_came_before() -> None:
     [(4_000_000, True), (4_039_000, True), (3_961_000, True), (4_041_000, False), (3_959_000, False)],
 )
 def test_the_gate_is_one_percent_to_either_side(value: int, inside: bool) -> None:
-    assert command.within(value, RECORD.instructions["six"]) is inside
+    assert instructions.within(value, RECORD.instructions["six"]) is inside
 
 
 def test_a_case_without_record_is_outside() -> None:
-    assert not command.within(4_000_000, RECORD.instructions.get("wrist"))
-    assert command.compared(4_000_000, None) == "not recorded"
+    assert not instructions.within(4_000_000, RECORD.instructions.get("wrist"))
+    assert instructions.compared(4_000_000, None) == "not recorded"
 
 
 def test_a_record_comes_back_as_written(tmp_path: Path) -> None:
     file = tmp_path / "baseline.json"
-    assert command.read(file) is None
-    command.write(RECORD, file)
-    assert command.read(file) == RECORD
+    assert instructions.read(file) is None
+    instructions.write(RECORD, file)
+    assert instructions.read(file) == RECORD
 
 
 @pytest.mark.parametrize("text", ["", "{}", '{"cpu": "x", "instructions": {"six": "many"}, "versions": {}}'])
@@ -67,17 +67,17 @@ def test_a_record_that_is_none_is_refused_by_name(tmp_path: Path, text: str) -> 
     file = tmp_path / "baseline.json"
     file.write_text(text)
     with pytest.raises(BaselineError, match=r"baseline\.json.*--record"):
-        command.read(file)
+        instructions.read(file)
 
 
 def test_the_record_of_the_project_holds_every_case() -> None:
-    record = command.read()
+    record = instructions.read()
     assert record is not None
     assert record.instructions.keys() == CASES.keys()
 
 
 def test_other_versions_are_named() -> None:
-    lines = command.other_versions({"numpy": "2.5.0", "cffi": "2.1.1"}, RECORD.versions)
+    lines = instructions.other_versions({"numpy": "2.5.0", "cffi": "2.1.1"}, RECORD.versions)
     assert lines == [
         "cffi is 2.1.1, recorded with absent",
         "numpy is 2.5.0, recorded with 2.4.6",
@@ -272,12 +272,12 @@ def six(emulated: Sysroot, folder: Path) -> Counted:
 
 
 def test_a_frame_of_six_markers_takes_the_instructions_of_the_record(six: Counted, emulated: Sysroot) -> None:
-    record = command.read()
+    record = instructions.read()
     assert record is not None
     assert six.per_frame["six"] > 640 * 480 / 4  # a scan of a quarter of the pixels cannot take fewer
-    differences = command.compared(six.per_frame["six"], record.instructions["six"])
-    others = command.other_versions(emulated.versions, record.versions)
-    assert command.within(six.per_frame["six"], record.instructions["six"]), (differences, others)
+    differences = instructions.compared(six.per_frame["six"], record.instructions["six"])
+    others = instructions.other_versions(emulated.versions, record.versions)
+    assert instructions.within(six.per_frame["six"], record.instructions["six"]), (differences, others)
 
 
 def test_detections_on_aarch64_are_those_of_this_machine_bit_by_bit(six: Counted, folder: Path) -> None:

@@ -1,8 +1,8 @@
 """Aarch64 instructions of the slave per frame, against the record (`make instructions`).
 
-    python -m bench instructions                  every case
-    python -m bench instructions six windows      some of: six windows numba numba-windows wrist wrist-numba seed
-    python -m bench instructions --record         every case, and what was counted is the new baseline
+    make instructions                                    every case
+    make instructions INSTRUCTIONS_ARGS='six windows'    some of: six windows numba numba-windows wrist wrist-numba seed
+    make instructions INSTRUCTIONS_ARGS=--record         every case, and what was counted is the new baseline
 
 Exit code: 0 within the gate, 1 outside it or detected otherwise than on this machine, 2 cannot be counted here.
 """
@@ -17,10 +17,10 @@ from typing import cast
 
 import msgspec
 
-from bench.aarch64 import scene
-from bench.aarch64.count import CPU, Counted, counted, native
-from bench.aarch64.guest import MACHINE_CODE
-from bench.aarch64.sysroot import CACHE, PYTHON, NotPossibleError, fast_wheels, prepare
+from tests.aarch64 import scene
+from tests.aarch64.count import CPU, Counted, counted, native
+from tests.aarch64.guest import MACHINE_CODE
+from tests.aarch64.sysroot import CACHE, PYTHON, NotPossibleError, fast_wheels, prepare
 
 FILE = Path(__file__).with_name("baseline.json")
 # Counts of one program differ by 1e-3 at most between places and days: what is outside was changed.
@@ -93,9 +93,7 @@ RATIOS = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Count, compare, record if wanted; return the exit code."""
     keep = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
-        "python -m bench instructions", description=__doc__, formatter_class=keep
-    )
+    parser = argparse.ArgumentParser("make instructions", description=__doc__, formatter_class=keep)
     parser.add_argument("cases", nargs="*", metavar="CASE", help=f"{' '.join(CASES)} (default: all)")
     parser.add_argument("--record", action="store_true", help="write the baseline")
     options = parser.parse_args(arguments)
@@ -171,3 +169,7 @@ def _within_gate(new: Baseline, old: Baseline) -> bool:
     if outside:
         print(f"  outside the gate of ±{100 * GATE:g} %: {', '.join(outside)}; if that is meant: --record")
     return not outside
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -10,8 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
-from bench.aarch64.guest import FIRST, LAST, MACHINE_CODE
-from bench.aarch64.sysroot import CACHE, PYTHON, ROOT, NotPossibleError, Sysroot
+from tests.aarch64.guest import FIRST, LAST, MACHINE_CODE
+from tests.aarch64.sysroot import CACHE, PYTHON, ROOT, NotPossibleError, Sysroot
 
 CPU = "cortex-a53"  # Raspberry Pi 3 and Zero 2 W: the slowest that is meant
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}
@@ -89,7 +89,7 @@ def _ask(
     command: Sequence[str], frames: Path, case: str, environment: Mapping[str, str]
 ) -> tuple[list[str], str]:
     """Labels of the marks that the program made, and the hash of what it detected."""
-    line = [*command, "-m", "bench.aarch64.guest", str(frames), case]
+    line = [*command, "-m", "tests.aarch64.guest", str(frames), case]
     result = subprocess.run(line, capture_output=True, text=True, env={**environment, **ONE_THREAD}, cwd=ROOT)
     if result.returncode != 0:
         raise NotPossibleError(f"{' '.join(line)} failed:\n{result.stderr.strip()}")

@@ -1,6 +1,6 @@
 """The program that is counted: runs one case frame by frame, and marks where the count is read.
 
-    python -m bench.aarch64.guest FOLDER CASE     prints a line of JSON: labels of the marks, hash of what was found
+    python -m tests.aarch64.guest FOLDER CASE     prints a line of JSON: labels of the marks, hash of what was found
 
 It also runs natively, for that hash: it must be equal on both architectures.
 """
@@ -16,7 +16,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bench.aarch64.frames import FRAME_NS, SIX, WRIST, read, read_strobed
 from bench.markers import published
 from common.messages import Message, WristDetections, encode
 from slave.markers.detector import Detections, MarkerDetector
@@ -25,6 +24,7 @@ from slave.sources import Frame
 from slave.wrist import engine as wrist_engine
 from slave.wrist.detector import WristDetector
 from slave.wrist.led_image import WristView
+from tests.aarch64.frames import FRAME_NS, SIX, WRIST, read, read_strobed
 
 FIRST, LAST = 20, 60  # the slope is taken between these counts of frames
 MACHINE_CODE = ("numba", "numba-windows", "wrist-numba")  # cases

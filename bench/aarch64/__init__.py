@@ -1,1 +1,0 @@
-"""Instructions of the slave per frame on aarch64, counted under emulation; see docs/instructions.md."""
