@@ -38,7 +38,7 @@ COMMANDS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "cameras": {
         "sync": ("cameras.sync", "depth of a hand at 1 m/s from unsynchronised cameras"),
-        "depth": ("cameras.depth", "depth at rest, and by the law of the shipped rig"),
+        "depth": ("cameras.depth", "depth of a hand at rest"),
         "uncertainty": ("cameras.uncertainty", "95 % regions of markers, rendered hands with wrong radii"),
         "occlusion": ("cameras.occlusion", "finger tips that no two cameras see"),
     },
@@ -50,7 +50,7 @@ COMMANDS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "hand, objects and gestures": {
         "fusion": ("both.fusion", "markers and wrist device as one hand, against each alone"),
-        "gesture_poses": ("gestures.poses", "the six study poses: people, rigs, recorded hands"),
+        "gesture_poses": ("gestures.poses", "the six study poses: people before rigs"),
         "gestures": ("gestures.actions", "pinch, dial, taps, pointing: late, missed, false"),
         "objects": ("objects.tracked", "objects of beads and of tags, rendered, detected, partly hidden"),
         "tags": ("objects.tags", "fiducial tags on generated frames; baseline: cv2.aruco"),

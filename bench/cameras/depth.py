@@ -1,8 +1,8 @@
-"""Depth: how still a resting marker's depth stands, the law of the shipped rig.
+"""Depth: how still a resting marker's depth stands.
 
-Static: a hand at rest 0.6 m before the rig `desk`, rendered with new sensor noise in every frame, through detector,
+A hand at rest 0.6 m before the rig `desk`, rendered with new sensor noise in every frame, through detector,
 synchronisation and triangulation, before and after the filter. Several places: a centroid's noise depends on where in
-a pixel it lies. Law: depth by the shipped power law against triangulation, over the volume of the rig.
+a pixel it lies.
 """
 
 from collections.abc import Iterator
@@ -19,9 +19,7 @@ from common.sim.motion import REST, HandState, angles_of, base_pose
 from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
 from master.calibrate.depth.fit import ideal_of
-from master.estimator.sensors import CameraArrays
-from master.fabrik.intersection import triangulate
-from master.rig.pipeline import build_pipeline, line_of
+from master.rig.pipeline import build_pipeline
 from master.rig.setup import RigSetup, load_setup
 from master.run.app import StageTimes
 from slave.markers.detector import MarkerDetector
@@ -41,11 +39,10 @@ class Static:
 
 
 def rows() -> Iterator[Row]:
-    """Measure a resting hand and the law."""
+    """Measure a resting hand."""
     cv2.setNumThreads(1)
     desk = load_setup(CALIBRATION, "desk")
     yield from _static_rows(desk)
-    yield from _law_rows(desk)
 
 
 def static(setup: RigSetup, place: int, frames: int = _FRAMES) -> Static:
@@ -98,24 +95,3 @@ def _static_rows(setup: RigSetup) -> Iterator[Row]:
     yield Row("  predicted, D^2/(f B) sqrt(2) sigma", rms(expected), "mm RMS", f"worst {expected.max():.2f}")
     note = f"worst {filtered.max():.2f}; goal <= 1"
     yield Row("resting hand: depth after the filter", rms(filtered), "mm RMS", note)
-
-
-def _law_rows(desk: RigSetup) -> Iterator[Row]:
-    """Depth by the shipped law against triangulation, of points over the whole volume, exact and with 0.1 px noise."""
-    volume, cameras = desk.rig.volume, tuple(desk.models.values())
-    assert volume is not None
-    rng, line, count = np.random.default_rng(7), line_of(desk, StageTimes()), len(desk.rig.markers)
-    points = rng.uniform(volume.low_m, volume.high_m, (4000 // count, count, 3))
-    nothing = np.full((2, count), np.nan)
-    for noise_px in (0.0, 0.1):
-        off: list[Float] = []
-        for some in points:
-            uv = np.stack([camera.project(some) for camera in cameras])
-            seen = ((uv > 0.0) & (uv < [cameras[0].width_px, cameras[0].height_px])).all(axis=(0, 2))
-            uv = uv + rng.normal(0.0, noise_px, uv.shape)
-            by_law = line.triangulate(uv, np.full((2, count), 0.1), nothing, None, 0.0, as_seen=True).points_m
-            by_rays = triangulate(CameraArrays.of(cameras), uv, 0.1).points_m
-            off.append((by_law - by_rays)[seen, 2])
-        mm = 1e3 * np.concatenate(off)
-        note = f"mean of sizes {np.abs(mm).mean():.2f}, worst {np.abs(mm).max():.1f}; goal 3"
-        yield Row(f"power law against stereo, {noise_px} px noise: depth", float(mm.mean()), "mm", note)

@@ -1,9 +1,8 @@
-"""The six study poses as the master recognises them: simulated people before rigs, and recorded hands.
+"""The six study poses as the master recognises them: simulated people before rigs.
 
-**Rigs**: a person with bones of its own, solved with bones as a calibration measures them; a wrist device sits a little
-otherwise than its file has it. Rendered at 30 Hz; hands turn by up to 35 degrees. **Wrist**: trials of the study. A
-frame is right if the pose held in truth is recognised, from the third frame after it was formed on; an episode is right
-if it is recognised by then. **leapjs**: an event is wrong if the recorded joints contradict it (`agrees`).
+**Rigs**: a person with bones of its own, solved with bones as a calibration measures them. Rendered at 30 Hz; hands
+turn by up to 35 degrees. **Wrist**: trials of the study. A frame is right if the pose held in truth is recognised, from
+the third frame after it was formed on; an episode is right if it is recognised by then.
 """
 
 import tempfile
@@ -15,20 +14,16 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
-from bench.both.scene import Both, Observed, cycles_of, in_order, orientations, solve
-from bench.hands.motion import SIGMA_M, Recorded, recordings, track
+from bench.both.scene import Observed, in_order, solve
 from bench.played import START_NS, found_by, times_of
-from bench.report import CALIBRATION, Row, datasets, rig_files, skipped
-from bench.study.trials import Participant, Task, participant, performed, rotated
+from bench.report import CALIBRATION, Row, rig_files
+from bench.study.trials import Participant, Task, participant, performed
 from common.arrays import Float
 from common.calibration.gesture_settings import default_gestures
-from common.geometry.transforms import matrix_to_quaternion
 from common.hand.model import HandModel
 from common.messages import JOINT_COUNT, HandPose, Source
 from common.sim.motion import POSES, StudyPoses
 from common.sim.scene import Scene, view_centre
-from common.sim.two_rigs import FlexedWrist
-from common.sim.wrist.scene import WristScene
 from master.gestures.features import FeatureExtractor
 from master.gestures.poses import PoseRecogniser
 from master.rig.setup import RigSetup, load_setup
@@ -112,15 +107,13 @@ def recognised(poses: Sequence[HandPose], model: HandModel) -> list[str | None]:
 PERSON = 20
 _RATE_HZ, _SECONDS = 30.0, 15.0  # one round of the six poses
 _MOTION, _WRIST_PEOPLE = 100, 3
-_ROTATION_RAD = np.radians(0.75)  # per axis, the error of a calibrated mounting
 
 
 def rows() -> Iterator[Row]:
-    """Measure a table of confusions for each rig, of one person; a wrist device; recorded hands."""
-    for rig, one in (_by_markers(PERSON) | _by_both(PERSON)).items():
+    """Measure a table of confusions for each rig, of one person, and of a wrist device."""
+    for rig, one in _by_markers(PERSON).items():
         yield from one.rows(f"{rig}, one person", "no goal: fingers hide" if rig == "desk" else "goal 98")
     yield from _worn().rows(f"wrist device, {_WRIST_PEOPLE} people")
-    yield from _leap_rows()
 
 
 def _by_markers(number: int) -> dict[str, RecognisedPoses]:
@@ -130,28 +123,6 @@ def _by_markers(number: int) -> dict[str, RecognisedPoses]:
     motion = StudyPoses(HandModel.of(who.hand), view_centre(four.rig), _MOTION + number)
     messages = _detected(Scene.of_motion(four.rig, four.cameras, who.hand, motion, _MOTION + number))
     return {name: _found(_known(_setup(name), who), messages, motion) for name in ("desk", "desk4")}
-
-
-def _by_both(number: int) -> dict[str, RecognisedPoses]:
-    """One person before two cameras with three markers on the back, without and with a wrist device."""
-    marked, worn = _setup("desk-back3"), load_setup(CALIBRATION, "wrist-back3")
-    who = _person(number, marked)
-    model, seed = HandModel.of(who.hand), _MOTION + number
-    motion = FlexedWrist(posed := StudyPoses(model, view_centre(marked.rig), seed), seed)
-    scene = Scene.of_motion(marked.rig, marked.cameras, who.hand, motion, seed)
-    rng = np.random.default_rng([number, 77])
-    true = replace(worn.rig, T_camera_palm=who.rig.T_camera_palm)
-    shift_m = 0.65e-3  # per axis, the error of a calibrated mounting
-    file = rotated(true, rng.normal(0.0, _ROTATION_RAD, 3), rng.normal(0.0, shift_m, 3))
-    device = WristScene(true, worn.cameras, model, motion, seed=seed, reflectance=who.reflectance)
-    alone = _known(marked, who)
-    both = Both("both-poses", seed, scene, device, alone, RigSetup.of(file, worn.cameras, alone.hand))
-    markers = _detected(scene)
-    messages = in_order([*markers, *orientations(both, _SECONDS), *cycles_of(both, _SECONDS)])
-    return {
-        "desk-back3": _found(alone, markers, posed),
-        "desk-back3 + wrist-back3": _found(both.fused, messages, posed),
-    }
 
 
 def _detected(scene: Scene) -> list[Observed]:
@@ -193,53 +164,3 @@ def _worn() -> RecognisedPoses:
         truth = [next((t.pose for t in done.held if t.from_ns <= p.t_ns <= t.to_ns), None) for p in poses]
         out.add(truth, recognised(poses, HandModel.of(done.hand)))
     return out
-
-
-def _leap_rows() -> Iterator[Row]:
-    """leapjs: events, and those that the recorded joints contradict."""
-    folder = datasets() / "leapjs"
-    if not folder.is_dir():
-        yield skipped("leapjs", folder)
-        return
-    wrong, count, seconds = 0, 0, 0.0
-    for seed, recorded in enumerate(recordings(folder)):
-        found = recognised(_poses_of(recorded, recorded.model(), seed), recorded.model())
-        before = [None, *found]
-        begun = [k for k, name in enumerate(found) if name is not None and name != before[k]]
-        wrong += sum(not agrees(str(found[k]), recorded.fingers_m[k]) for k in begun)
-        count, seconds = count + len(begun), seconds + 1e-9 * float(recorded.t_ns[-1])
-    yield Row("leapjs: wrong poses recognised", float(wrong), "", f"goal 0; of {count} in {seconds:.0f} s")
-
-
-def _poses_of(recorded: Recorded, model: HandModel, seed: int) -> list[HandPose]:
-    """A recording through estimator and filter."""
-    points, towards = recorded.caps(model)
-    noise = np.random.default_rng([seed, 17]).normal(0.0, SIGMA_M, points.shape)
-    _, shown = track(model, recorded.t_ns, points + noise, towards)
-    return [
-        pose_of(model, t, one.joints.position_m, matrix_to_quaternion(one.joints.rotation), one.angles_rad)
-        for t, one in zip(recorded.t_ns.tolist(), shown, strict=True)
-    ]
-
-
-def agrees(name: str, fingers_m: Float) -> bool:
-    """Return whether joints (5, 4, 3) [m], palm frame, may be such a pose, by bends and the gap of thumb and index."""
-    bone = np.diff(fingers_m[1:], axis=1)
-    bone = bone / np.linalg.norm(bone, axis=2, keepdims=True)
-    # Fingers spread to the side are no less stretched: of the first bone only what it leaves the palm's plane by.
-    lowered = np.arctan2(-bone[:, 0, 1], bone[:, 0, 2])
-    bends = np.degrees(lowered + np.arccos(np.clip((bone[:, 0] * bone[:, 1]).sum(axis=-1), -1.0, 1.0)))
-    stretched_deg, bent_deg = 50.0, 85.0  # bends of the recorded joints, MCP and PIP together
-    stretched, bent = bends < stretched_deg, bends > bent_deg
-    gap = float(np.linalg.norm(fingers_m[0, 3] - fingers_m[1, 3]))
-    pinched_m, grasped_m = 0.075, 0.045  # from the thumb's tip joint to that of the index: at most, at least
-    rules = {
-        "open_palm": stretched.all(),
-        "counting_two": stretched[:2].all() and bent[2:].all(),
-        "pointing": stretched[0] and bent[1:].all(),
-        "small_grasp": bent.all(),
-        "large_grasp": not stretched.all() and gap > grasped_m,
-        "pinch": gap < pinched_m and not stretched[0],
-    }
-    assert set(rules) == set(POSES)
-    return bool(rules[name])

@@ -168,24 +168,3 @@ def _baseline(detector: cv2.aruco.ArucoDetector, number: int, image: Image, corn
     if number not in numbers:
         return np.empty((0, 2))
     return np.asarray(quads[numbers.index(number)], np.float64).reshape(4, 2) - corners
-
-
-def clutter(rng: np.random.Generator) -> Image:
-    """A desk full of dark and bright four-sided things, most with a border as of tags about random cells, and noise."""
-    shape = (640, 480)
-    coarse = rng.integers(40, 220, (12, 16, 3), np.uint8)
-    image = np.asarray(cv2.resize(coarse, shape, interpolation=cv2.INTER_CUBIC), np.uint8)
-    for _ in range(40):
-        side, cells = rng.uniform(16, 90), int(rng.integers(3, 9))
-        patch = np.pad(rng.integers(0, 2, (cells, cells), np.uint8), int(rng.random() < 0.7))
-        patch = np.pad(patch, 1, constant_values=1)
-        angle, at = rng.uniform(0.0, np.pi), rng.uniform([0, 0], shape)
-        rotation = (
-            np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) * side / len(patch)
-        )
-        warp = np.column_stack([rotation, at])
-        over = cv2.warpAffine(255 * patch, warp, shape, flags=cv2.INTER_NEAREST)
-        mask = cv2.warpAffine(np.ones_like(patch), warp, shape, flags=cv2.INTER_NEAREST)
-        image[mask > 0] = np.asarray(over)[mask > 0][:, None]
-    noisy = np.asarray(cv2.GaussianBlur(image, (0, 0), 0.6)) + rng.normal(0.0, 3.0, image.shape)
-    return np.clip(noisy, 0, 255).astype(np.uint8)

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.objects.tags import Look, clutter, tag_picture
+from bench.objects.tags import Look, tag_picture
+from common.arrays import Image
 from common.calibration import CameraCalibration, load
 from common.calibration.object_profile import ObjectProfile, Tag, TagFamily, Tags
 from common.errors import CalibrationError
@@ -23,6 +24,27 @@ HERE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 
 def box(family: TagFamily = "aruco_5x5_100", numbers: range = range(8), name: str = "box") -> ObjectProfile:
     tags = tuple(Tag(id=number, edge_m=0.032, T_object_tag=HERE) for number in numbers)
     return ObjectProfile(version=1, name=name, tags=Tags(family, tags))
+
+
+def clutter(rng: np.random.Generator) -> Image:
+    """A desk full of dark and bright four-sided things, most with a border as of tags about random cells, and noise."""
+    shape = (640, 480)
+    coarse = rng.integers(40, 220, (12, 16, 3), np.uint8)
+    image = np.asarray(cv2.resize(coarse, shape, interpolation=cv2.INTER_CUBIC), np.uint8)
+    for _ in range(40):
+        side, cells = rng.uniform(16, 90), int(rng.integers(3, 9))
+        patch = np.pad(rng.integers(0, 2, (cells, cells), np.uint8), int(rng.random() < 0.7))
+        patch = np.pad(patch, 1, constant_values=1)
+        angle, at = rng.uniform(0.0, np.pi), rng.uniform([0, 0], shape)
+        rotation = (
+            np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) * side / len(patch)
+        )
+        warp = np.column_stack([rotation, at])
+        over = cv2.warpAffine(255 * patch, warp, shape, flags=cv2.INTER_NEAREST)
+        mask = cv2.warpAffine(np.ones_like(patch), warp, shape, flags=cv2.INTER_NEAREST)
+        image[mask > 0] = np.asarray(over)[mask > 0][:, None]
+    noisy = np.asarray(cv2.GaussianBlur(image, (0, 0), 0.6)) + rng.normal(0.0, 3.0, image.shape)
+    return np.clip(noisy, 0, 255).astype(np.uint8)
 
 
 @pytest.mark.parametrize(
