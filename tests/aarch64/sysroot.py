@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from bench.cached import key_of, made_once
+from tests.cached import key_of, made_once
 
 ROOT = Path(__file__).resolve().parents[2]
 CACHE = ROOT / "out" / "aarch64"

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from bench.cached import key_of, made_once
+from tests.cached import key_of, made_once
 from tests.hosts.debian import cache
 
 SUITE, MIRROR = "trixie", "http://deb.debian.org/debian"

@@ -5,7 +5,7 @@ import platform
 import subprocess
 from pathlib import Path
 
-from bench.cached import key_of, made_once
+from tests.cached import key_of, made_once
 from tests.programs import missing
 
 SUITE, MIRROR = "trixie", "http://deb.debian.org/debian"

@@ -12,8 +12,8 @@ import subprocess
 import time
 from pathlib import Path
 
-from bench.cached import made_once
 from tests.aarch64.sysroot import PYTHON, Sysroot
+from tests.cached import made_once
 from tests.hosts.board_image import MIRROR, SUITE, run
 from tests.hosts.debian import cache
 from tests.hosts.rig import ROOT

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.cached import key_of, made_once
+from tests.cached import key_of, made_once
 
 
 def test_it_is_made_once_and_what_was_worked_with_goes(tmp_path: Path) -> None:
