@@ -40,13 +40,13 @@ from master.estimator.kinematics import (
 )
 from master.estimator.parameters import HandTables
 from master.estimator.problem import Rig
-from master.estimator.settings import Settings
+from master.estimator.settings import KERNEL, Settings
 from master.estimator.state import Hidden
 from master.fabrik.joints import START, put_vector, vector_at
 from master.fabrik.linear_algebra import Vector, cholesky, eigen, minus, plus
 
 _LAST = constant(3)  # joint of a finger: its tip
-MOST_ROTATIONS = 12  # turns that count in arcs: those of the palm, which moves all joints, then the largest
+MOST_ROTATIONS = KERNEL.rotations
 _PAIRS = MOST_ROTATIONS * (MOST_ROTATIONS + 1) // 2
 
 
@@ -230,8 +230,7 @@ def is_small(hand: HandTables, cov: Float, joint: int, most_m: float) -> bool:
 
     That of its finger's PIP must, too: a tip may be known to millimetres, and not how the finger is bent.
     """
-    quantile_95 = 7.815  # chi square of three numbers
-    most_m2 = most_m * most_m / quantile_95
+    most_m2 = most_m * most_m / KERNEL.region_95
     return _widest(cov[joint]) < most_m2 and _widest(cov[hand.middle[joint]]) < most_m2
 
 
@@ -502,5 +501,5 @@ def add_second_order(
                     mx, my, mz = mx + hx, my + hy, mz + hz
                 _add_square(out, share, hx, hy, hz)
                 pair += 1
-        _add_square(out, 0.25, mx, my, mz)
+        _add_square(out, 1.0 / 4.0, mx, my, mz)
         out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]

@@ -170,7 +170,6 @@ class Fitted:
     off: Bool = field(default_factory=lambda: np.zeros(5, np.bool_))
 
 
-_STIFF_RAD = np.radians(1.0)  # of fingers that are taken to bend as their PIP does
 _EYE, _AT_ORIGIN = np.eye(3), np.eye(4)
 
 
@@ -287,8 +286,7 @@ class EpochSteps:
             epoch_prior.axes[:] = 0.0 if orientation.axes is None else orientation.axes
         epoch_prior.place_w2[0] = 0.0
         if at.place is not None:
-            stands_m = 1e-4  # of a palm before the wrist device alone, whose frame is the rig's
-            epoch_prior.place[:], epoch_prior.place_w2[0] = at.place, stands_m**-2.0
+            epoch_prior.place[:], epoch_prior.place_w2[0] = at.place, self._settings.stands_m**-2.0
 
     def predict(self) -> float:
         """Write where the state has the hand; as `predict_epoch`."""
@@ -328,19 +326,21 @@ class EpochSteps:
         if len(points) < 2:
             return False
         off = points - points.mean(axis=0)
-        spread_m = 5e-3  # markers nearer than this to one line do not turn a hand about it
+        s = self._settings
         if len(points) > 2:  # plainly not in one line, without what a decomposition takes
             length2 = np.vecdot(off, off)
             along, longest2 = off @ off[length2.argmax()], float(length2.max())
-            if longest2 > 0.0 and float((length2 - along * along / longest2).max()) > (4.0 * spread_m) ** 2:
+            if (
+                longest2 > 0.0
+                and float((length2 - along * along / longest2).max()) > (4.0 * s.line_width_m) ** 2
+            ):
                 return True
         _, extent, axes = np.linalg.svd(off)
-        if len(points) > 2 and extent[1] > spread_m:
+        if len(points) > 2 and extent[1] > s.line_width_m:
             return True
         back = self.at.ground.back[0]
-        length_m = 20e-3  # a line shorter than this has no direction
-        across = 0.9  # cosine to the sight, at most
-        return bool(back and extent[0] > length_m and abs(axes[0] @ at.back_normal) < across)
+        has_direction = extent[0] > s.line_length_m and abs(axes[0] @ at.back_normal) < s.line_across
+        return bool(back and has_direction)
 
     def has_outlier(self) -> bool:
         """Return whether a marker is too far from what was found."""
@@ -354,7 +354,7 @@ class EpochSteps:
         prior.abduction[:], prior.flexion[:] = s.abduction_rad, s.coupled_rad
         prior.abduction[0] = prior.flexion[0] = 0.5 * s.thumb_rad
         if wrist.natural_only:
-            prior.natural_only[0], prior.flexion[:] = 1.0, _STIFF_RAD
+            prior.natural_only[0], prior.flexion[:] = 1.0, s.stiff_rad
         state.stationary[:] = stationary_of(s, loose=wrist.loose, tilt_rad=wrist.tilt_rad)
         state.z_cov[:] = np.diag(state.stationary)
         if wrist.heading_rad is not None:

@@ -24,12 +24,10 @@ from master.estimator.parameters import HandParameters
 from master.estimator.posterior import ON_OTHERS
 from master.estimator.priors import PosturePrior, WristModel, curled, posture_prior_of
 from master.estimator.sensors import HEADING, LED_SCALE, WRIST_ANGLES
-from master.estimator.settings import DEFAULT, Settings
-from master.estimator.solve import MAX_ITERATIONS
+from master.estimator.settings import DEFAULT, KERNEL, LAWS, Settings
 from master.estimator.update import Estimate
 from master.rig.merge import inside
 
-_BENDS_RAD = (0.1, 0.7, 1.3)  # of the PIP, from which a reinitialising search begins: open to closed
 _AT_ORIGIN = np.eye(4)
 NONE = frozenset[int]()
 
@@ -47,9 +45,10 @@ class Reinitialiser:
         """Prepare; `posture_prior` gives that of a hand with fingers unlike the others."""
         self._steps, self._parameters = steps, parameters
         self._posture_prior, self._settings = posture_prior, settings
-        postures = np.zeros((len(_BENDS_RAD), 5, 4))
-        mcp_per_pip = 0.6
-        postures[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (mcp_per_pip, 1.0))[:, None]
+        postures = np.zeros((len(LAWS.begin_pip_rad), 5, 4))
+        postures[:, 1:, 1:3] = np.multiply.outer(LAWS.begin_pip_rad, (settings.begin_mcp_per_pip, 1.0))[
+            :, None
+        ]
         self._postures = np.array([parameters.of_angles(angles) for angles in postures])
         self._finger_of_free = parameters.free // 4
         any_finger = posture_prior(NONE)
@@ -86,7 +85,7 @@ class Reinitialiser:
                 x = np.where(shows, self._parameters.of_angles(start.angles_rad), self._natural)
                 begin.palm[:], begin.x[:] = start.T_rig_palm, self._with_scanned(x)
                 chi2 = steps.fit(posture_prior)
-                if steps.at.found.steps[0] < MAX_ITERATIONS and not steps.has_outlier():
+                if steps.at.found.steps[0] < KERNEL.steps and not steps.has_outlier():
                     return chi2
             ends = list[tuple[float, Float, Float]]()
             starts = self._starts(at)
@@ -108,9 +107,8 @@ class Reinitialiser:
             T = np.eye(4)
             T[:3, :3], T[:3, 3] = measured, epoch.place
             return [(T, self._with_scanned(self._natural.copy()))]
-        triangulated = steps.triangulated
-        above_m, above_weight, palm_weight = 0.05, 0.3, 3.0
-        weight = np.where(steps.finger[triangulated] >= 0, 1.0, palm_weight)
+        triangulated, s = steps.triangulated, self._settings
+        weight = np.where(steps.finger[triangulated] >= 0, 1.0, s.begin_palm_weight)
         observed = epoch.points_m[steps.on_hand][triangulated]
         starts: list[tuple[Float, Float]] = []
         for posture in self._postures:
@@ -122,12 +120,12 @@ class Reinitialiser:
                 T[:3, 3] = np.average(observed - expected @ measured.T, axis=0, weights=weight)
             elif steps.at.epoch_prior.back_normal_w2[0] > 0.0:
                 # A point above the wrist stands for "the back of the hand faces the cameras".
-                above = expected.mean(axis=0) + np.array([0.0, above_m, 0.0])
-                towards = observed.mean(axis=0) + above_m * epoch.back_normal
+                above = expected.mean(axis=0) + np.array([0.0, s.begin_above_m, 0.0])
+                towards = observed.mean(axis=0) + s.begin_above_m * epoch.back_normal
                 T = fit_rigid(
                     np.vstack([observed, towards]),
                     np.vstack([expected, above]),
-                    np.append(weight, above_weight),
+                    np.append(weight, s.begin_above_weight),
                 )
             else:
                 T = fit_rigid(observed, expected, weight)
@@ -147,9 +145,6 @@ class Reinitialiser:
             return x
         scanned = self._parameters.of_angles(self._steps.at.task.scanned.reshape(5, 4))
         return np.where(known[self._finger_of_free], scanned, x)
-
-
-_SURE_RAD2 = 3.0 * np.radians(5.0) ** 2  # of the turn of a palm that markers place well
 
 
 class Estimator:
@@ -259,7 +254,8 @@ class Estimator:
                 steps.set_priors(replace(at, orientation=orientation), known=known)
                 out, reinitialised = self._solve(replace(at, orientation=orientation), known=known)
                 rejected = orientation is None
-                if rejected and np.trace(self._at.found.cov[:3, :3]) < _SURE_RAD2:
+                sure_rad2 = 3.0 * self.settings.sure_palm_rad**2
+                if rejected and np.trace(self._at.found.cov[:3, :3]) < sure_rad2:
                     break
         by_device = self.wrist and bool(task.solver_mode.any())
         if ground.seen[0] > 0 or (by_device and (at.place is not None or self._knows_place())):
@@ -306,8 +302,7 @@ class Estimator:
 
     def _knows_place(self) -> bool:
         """Return whether the position of a hand measured only by its fingers is known."""
-        somewhere_m = 0.1  # about each axis: a hand that is known no better than this is lost
-        return self.known and float(np.trace(self._now.cov[3:6, 3:6])) < 3.0 * somewhere_m**2
+        return self.known and float(np.trace(self._now.cov[3:6, 3:6])) < 3.0 * self.settings.lost_m**2
 
     def _sources(self, at: Epoch, *, palm_shown: bool) -> Int:
         """What each finger and the palm rest on (6,), as of `Fitted`; devices by level."""

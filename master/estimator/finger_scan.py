@@ -26,14 +26,12 @@ from master.estimator.kinematics import twist_hand
 from master.estimator.parameters import HandTables
 from master.estimator.problem import Rig
 from master.estimator.sensors import CycleRows
-from master.estimator.settings import Settings
+from master.estimator.settings import KERNEL, Settings
 from master.fabrik.linear_algebra import cholesky, substitute
 
-NODES, FINE = 16, 4
+NODES, FINE = KERNEL.nodes, KERNEL.fine
 _PLACES = FINE * (NODES - 1) + 1  # of a density, in fine steps
-ROWS = 8  # laser 2, tip 2, depth, abduction, DIP, twist
-HANDS = 3
-_COARSE_RAD = (0.15, 0.6, 1.05, 1.4)  # flexions that are tried
+ROWS, HANDS = 8, 3  # laser 2, tip 2, depth, abduction, DIP, twist; as of `_NATURAL`
 
 
 class Prior:
@@ -181,8 +179,7 @@ def _put(hand: HandTables, f: int, x0: float, x1: float, x3: float, twist: float
     a[4 * f] = min(max(x0, hand.limits[f, 0, 0]), hand.limits[f, 0, 1])
     a[4 * f + 1] = min(max(x1, hand.limits[f, 1, 0]), hand.limits[f, 1, 1])
     a[4 * f + 3] = min(max(x3, hand.limits[f, 3, 0]), hand.limits[f, 3, 1])
-    rolled_rad = 0.25  # no hinges are askew by more
-    scan.twist[f] = min(max(twist, -rolled_rad), rolled_rad)
+    scan.twist[f] = min(max(twist, -KERNEL.rolled_rad), KERNEL.rolled_rad)
     twist_hand(hand, scan.twist)
 
 
@@ -223,13 +220,13 @@ def _start(rig: Rig, lines: CycleRows, prior: Prior, f: int, node: int, scan: Sc
 
     From the pose of the PIP before; at the first node, and every few others, rather from one that is tried.
     """
-    pip, restart, coarse = scan.angles[4 * f + 2], 5, 4
+    pip, tried = scan.angles[4 * f + 2], len(KERNEL.tried_rad)
     dip = prior.base_rad[f, 3] + prior.per_pip[f, 3] * pip
     aside = prior.base_rad[f, 0] + prior.per_pip[f, 0] * pip
-    best, at = inf, coarse
-    if (node - scan.first[f]) % restart == 0:
-        for start in range(coarse):
-            _put(rig.hand, f, aside, _COARSE_RAD[start], dip, prior.twist[f], scan)
+    best, at = inf, tried
+    if (node - scan.first[f]) % KERNEL.tried_every == 0:
+        for start in range(tried):
+            _put(rig.hand, f, aside, KERNEL.tried_rad[start], dip, prior.twist[f], scan)
             _look(rig, prior, f, NO_MOVES, scan)
             cost = _rows(rig, lines, prior, f, scan)
             if cost < best:
@@ -237,13 +234,12 @@ def _start(rig: Rig, lines: CycleRows, prior: Prior, f: int, node: int, scan: Sc
     if node > scan.first[f]:
         before = scan.x[f, node - 1]
         _put(rig.hand, f, before[0], before[1], before[3], before[4], scan)
-        if at < coarse:
+        if at < tried:
             _look(rig, prior, f, NO_MOVES, scan)
-            at = coarse if _rows(rig, lines, prior, f, scan) < best else at
-    if at < coarse:
-        _put(rig.hand, f, aside, _COARSE_RAD[at], dip, prior.twist[f], scan)
-    from_before, from_tried = 3, 5  # steps
-    return from_before if at == coarse else from_tried
+            at = tried if _rows(rig, lines, prior, f, scan) < best else at
+    if at < tried:
+        _put(rig.hand, f, aside, KERNEL.tried_rad[at], dip, prior.twist[f], scan)
+    return KERNEL.steps_from_node if at == tried else KERNEL.steps_from_tried
 
 
 @inner
@@ -265,8 +261,7 @@ def _descend(rig: Rig, lines: CycleRows, prior: Prior, f: int, steps: int, scan:
             step[u] = -scan.g[u]
         substitute(scan.L, 4, step)
         for u in range(4):
-            farthest_rad = 0.3  # of one step
-            step[u] = min(max(step[u], -farthest_rad), farthest_rad)
+            step[u] = min(max(step[u], -KERNEL.step_rad), KERNEL.step_rad)
         abduction, flexion, dip = a[4 * f] + step[0], a[4 * f + 1] + step[1], a[4 * f + 3] + step[2]
         _put(rig.hand, f, abduction, flexion, dip, scan.twist[f] + step[3], scan)
     return cost, length
@@ -305,8 +300,7 @@ def _shows(prior: Prior, length: float, scan: Scan) -> bool:
         return True
     away = sqrt(t[0] * t[0] + t[1] * t[1] + t[2] * t[2])
     for k in range(7):
-        hidden_m = 1.5e-3  # of a fingertip behind the skin that the camera sees: its own roundness
-        if first_hit(scan.surface.camera[k], t[0] / away, t[1] / away, t[2] / away) < away - hidden_m:
+        if first_hit(scan.surface.camera[k], t[0] / away, t[1] / away, t[2] / away) < away - KERNEL.hidden_m:
             return False
     return True
 

@@ -22,12 +22,13 @@ from common.kernels import constant, inlined, inner
 from common.records import array
 from master.estimator.kinematics import finger_chain, hinge_axis
 from master.estimator.parameters import HandTables
+from master.estimator.settings import KERNEL
 
 # Abduction, flexion, PIP, DIP, twist, and the wrist's flexion and deviation; all, those of the finger itself, none.
 MOVES, OWN_MOVES, NO_MOVES = constant(7), constant(5), constant(0)
 _BONE = np.array([0, 0, 0, 0, 1, 1, 2, 2])
 _ROOT = 4  # spheres of the first bone, which of a thumb is in its ball
-RAYS = 16
+RAYS = KERNEL.rays
 
 
 class Surface:
@@ -101,12 +102,10 @@ def crossing(device: Any, f: int, work: Surface) -> int:
         dot = x * along[k, 0] + y * along[k, 1] + z * along[k, 2]
         x, y, z = x - dot * along[k, 0], y - dot * along[k, 1], z - dot * along[k, 2]
         scale = device.radius[f, k] / sqrt(x * x + y * y + z * z)
-        # pulled in
-        pulled_in = 0.77 * scale
+        pulled_in = KERNEL.pulled_in * scale
         Q[k, 0], Q[k, 1], Q[k, 2] = S[k, 0] + pulled_in * x, S[k, 1] + pulled_in * y, S[k, 2] + pulled_in * z
         if k == 7:
-            cap_along, cap_out = 0.7, 0.5  # radii from the last sphere to where the skin turns away
-            out, ahead = cap_out * scale, cap_along * device.radius[f, k]
+            out, ahead = KERNEL.cap_out * scale, KERNEL.cap_along * device.radius[f, k]
             Q[8, 0] = S[7, 0] + out * x + ahead * along[7, 0]
             Q[8, 1] = S[7, 1] + out * y + ahead * along[7, 1]
             Q[8, 2] = S[7, 2] + out * z + ahead * along[7, 2]
@@ -130,8 +129,7 @@ def crossing(device: Any, f: int, work: Surface) -> int:
         at = 7 if device.before[0] * near > 0.0 else 0
     x, y, z = Q[at + 1, 0] - Q[at, 0], Q[at + 1, 1] - Q[at, 1], Q[at + 1, 2] - Q[at, 2]
     rise, length = n[0] * x + n[1] * y + n[2] * z, sqrt(x * x + y * y + z * z)
-    level = 0.05  # a chain less inclined to the plane slides along it without an end
-    least = level * length
+    least = KERNEL.level * length
     held = rise
     if abs(rise) < least:
         held = least if rise >= 0.0 else -least
@@ -139,8 +137,7 @@ def crossing(device: Any, f: int, work: Surface) -> int:
         height = near if at == 7 else first
         if at == 7:
             height -= rise  # of the beginning of the stretch
-        farthest = 6.0  # lengths of its last stretch that a chain which ends before the plane is prolonged
-        share = min(max(-height / held, -farthest), farthest)
+        share = min(max(-height / held, -KERNEL.prolonged), KERNEL.prolonged)
     for i in range(3):
         w = Q[at + 1, i] - Q[at, i]
         work.q[i] = Q[at, i] + share * w
@@ -252,12 +249,12 @@ def _lit_span(device: Any, f: int, work: Surface) -> tuple[float, float]:
             y = S[k - 1, 1] + share * (S[k, 1] - S[k - 1, 1]) - laser[1]
             z = S[k - 1, 2] + share * (S[k, 2] - S[k - 1, 2]) - laser[2]
             angle, away = _in_plane(device, x, y, z)
-            wide = 1.3 * max(r, radius[k - 1]) / away
+            wide = KERNEL.span_crossed * max(r, radius[k - 1]) / away
             low, high = min(low, angle - wide), max(high, angle + wide)
         if abs(height) < r:
             angle, away = _in_plane(device, S[k, 0] - laser[0], S[k, 1] - laser[1], S[k, 2] - laser[2])
-            wide = sqrt(r * r - height * height) / away
-            low, high = min(low, angle - 1.1 * wide), max(high, angle + 1.1 * wide)
+            wide = KERNEL.span_cut * (sqrt(r * r - height * height) / away)
+            low, high = min(low, angle - wide), max(high, angle + wide)
         near = height
     return low, high
 
@@ -294,8 +291,7 @@ def _cast(device: Any, angle: float, first: int, work: Surface, lit: Float) -> N
     for k in range(7):
         if work.begins[k] < distance:  # what is farther hides nothing
             seen = min(seen, first_hit(work.camera[k], ex, ey, ez))
-    seen_m = 3e-4  # a lit point this near behind the first the camera sees is seen
-    lit[3] = min(seen - distance, 0.0) + seen_m
+    lit[3] = min(seen - distance, 0.0) + KERNEL.seen_m
 
 
 @inlined
@@ -305,8 +301,7 @@ def _chord(here: Float, there: Float, broad: float) -> tuple[float, float, float
     if not (a > -inf and b > -inf) or (a <= 0.0 and b <= 0.0):
         return 0.0, 0.0, 0.0
     dx, dy, dz = there[0] - here[0], there[1] - here[1], there[2] - here[2]
-    stretch = 0.5  # share of the finger's breadth that one chord may span: more is a jump from part to part
-    if dx * dx + dy * dy + dz * dz > (stretch * broad) ** 2:
+    if dx * dx + dy * dy + dz * dz > (KERNEL.chord * broad) ** 2:
         return 0.0, 0.0, 0.0
     begin = a / (a - b) if a <= 0.0 else 0.0
     end = a / (a - b) if b <= 0.0 else 1.0
@@ -346,7 +341,7 @@ def look(
             t[i] += R[2, i, j] * device.tip[f, j]
     x, y = q[0] / q[2], q[1] / q[2]
     tx, ty = t[0] / t[2], t[1] / t[2]
-    seen[0], seen[1], seen[2], seen[3], seen[4] = x, y, tx, ty, log(max(t[2], 1e-3))
+    seen[0], seen[1], seen[2], seen[3], seen[4] = x, y, tx, ty, log(max(t[2], KERNEL.nearest_m))
     if moves == 0:
         return at
     for k in range(4):

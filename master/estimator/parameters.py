@@ -31,10 +31,8 @@ from common.hand.model import CHAINS, FINGER_JOINTS, HandModel
 from common.hand.profiles import ABDUCTION, FLEXION, spread_left
 from common.kernels import inlined, inner
 from common.records import array, filled, record
+from master.estimator.settings import KERNEL
 from master.fabrik.linear_algebra import cholesky, inverse
-
-_PALM = (1.0, 0.1)  # [rad], [m]: a hand in front of cameras, before anything is seen of it
-REACH = 3.0  # standard deviations beyond a limit, where there is no hand
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,15 +70,14 @@ class HandParameters:
                 high[1:, 2] = np.minimum(high[1:, 2], high[1:, 3] / ratio)
         low, high, tolerance = low.reshape(20), high.reshape(20), model.tolerance_rad.reshape(20)[free]
         inverse = np.where(tolerance > 0.0, tolerance, np.inf) ** -2.0
-        narrowest_rad = 1e-3  # limits that leave an angle no room
-        span = np.maximum(high - low, narrowest_rad)[free]
+        span = np.maximum(high - low, KERNEL.narrowest_rad)[free]
         most = model.limits_rad[:, FLEXION, 1]
         narrows = np.flatnonzero((model.spread_at_full_flexion < 1.0) & (most > 0.0))
         return cls(
             free,
             complete,
-            low[free] - REACH * tolerance,
-            high[free] + REACH * tolerance,
+            low[free] - KERNEL.tolerances * tolerance,
+            high[free] + KERNEL.tolerances * tolerance,
             low[free],
             high[free],
             inverse,
@@ -89,7 +86,7 @@ class HandParameters:
             _evenly(np.searchsorted(free, 4 * narrows + FLEXION)),
             most[narrows],
             model.spread_at_full_flexion[narrows],
-            np.concatenate([np.repeat(np.array(_PALM) ** -2.0, 3), 12.0 / (span * span)]),
+            np.concatenate([np.repeat(np.array([1.0, KERNEL.anywhere_m]) ** -2.0, 3), 12.0 / (span * span)]),
         )
 
     def angles(self, x: Float) -> Float:
@@ -194,6 +191,7 @@ class HandTables:
         most = np.ascontiguousarray(model.limits_rad[:, 1, 1])
         first_bone = np.einsum("fij,fj->fi", model.swing[:2, :, 1].sum(axis=0), model.bone_m[:, 0])
         stiff_rad = 1e-9  # an angle whose highest flexion is 0 narrows nothing
+        tolerance = KERNEL.tolerances * model.tolerance_rad
         return filled(
             record(cls, n=len(parameters.free)),
             swing=model.swing,
@@ -213,7 +211,7 @@ class HandTables:
             beyond_w2=parameters.beyond_w2,
             at_low_limit=parameters.at_low_limit,
             anywhere=parameters.anywhere,
-            limits=model.limits_rad + REACH * np.stack([-model.tolerance_rad, model.tolerance_rad], axis=2),
+            limits=model.limits_rad + np.stack([-tolerance, tolerance], axis=2),
             finger=finger,
             level=level,
             middle=middle,
@@ -279,8 +277,7 @@ def _cut(middle: float, variance: float, low: float, high: float) -> tuple[float
     flipped = a > 0.0  # mirrored, so that no tail is the difference of two numbers near 1
     if flipped:
         a, b = -b, -a
-    far = 30.0  # standard deviations, beyond which the normal distribution underflows
-    a, b = min(max(a, -far), far), min(max(b, -far), far)
+    a, b = min(max(a, -KERNEL.tail), KERNEL.tail), min(max(b, -KERNEL.tail), KERNEL.tail)
     at_a, at_b = exp(-0.5 * a * a), exp(-0.5 * b * b)
     norm = max(_below(b) - _below(a), 1e-300) * sqrt(2.0 * pi)
     shift = (at_a - at_b) / norm
@@ -307,8 +304,7 @@ def truncated_mean(hand: HandTables, normal: Float, gradient: Float, x: Float, c
         on_limit_rad = 1e-9
         if below > -on_limit_rad or above < on_limit_rad:
             cut.pull[6 + i] = -gradient[6 + i]
-    sweeps, damping = 6, 0.8
-    for sweep in range(sweeps + 1):
+    for sweep in range(KERNEL.sweeps + 1):
         for i in range(N):
             for j in range(i + 1):
                 cut.total[i, j] = normal[i, j]
@@ -324,7 +320,7 @@ def truncated_mean(hand: HandTables, normal: Float, gradient: Float, x: Float, c
             for j in range(N):
                 pushed = cut.push[j - 6] if 6 <= j < 6 + n else 0.0
                 mean[i] += cut.cov[i, j] * (cut.pull[j] + pushed)
-        if sweep == sweeps:
+        if sweep == KERNEL.sweeps:
             break
         for i in range(n):
             below, above = (-inf if hand.at_low_limit[i] else hand.low[i] - x[i]), hand.high[i] - x[i]
@@ -336,8 +332,8 @@ def truncated_mean(hand: HandTables, normal: Float, gradient: Float, x: Float, c
             middle = cavity_variance * (mean[6 + i] / variance - cut.push[i])
             at, narrow = _cut(middle, cavity_variance, below, above)
             better = max(1.0 / narrow - 1.0 / cavity_variance, 0.0)
-            cut.weight[i] += damping * (better - cut.weight[i])
-            cut.push[i] += damping * (at / narrow - middle / cavity_variance - cut.push[i])
+            cut.weight[i] += KERNEL.sweep_share * (better - cut.weight[i])
+            cut.push[i] += KERNEL.sweep_share * (at / narrow - middle / cavity_variance - cut.push[i])
     for i in range(n):
         below = -inf if hand.at_low_limit[i] else hand.low[i] - x[i]
         mean[6 + i] = min(max(mean[6 + i], below), hand.high[i] - x[i])

@@ -51,13 +51,14 @@ from master.estimator.smoothing import HandOneEuro
 from master.fabrik.caps import LensShift
 from master.fabrik.intersection import Prior, among, associate, triangulate
 from master.fabrik.rays import RayPositions, RayTriangulator
+from master.fabrik.settings import NEVER_NS
 from master.fabrik.solver import FabrikSolver, Stage
 from master.fabrik.sync import FrameSet
 
 if TYPE_CHECKING:  # it imports this file
     from master.estimator.wrist_pipeline import WristSide
 
-REACH_NS = 50_000_000  # farther from an epoch a sample does not constrain it
+_REACH_NS = round(1e9 * DEFAULT.sample_reach_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,8 +86,7 @@ class OrientationSamples:
     def __init__(self, counts: Counter[str], drift_rad_s: float, late_us: float = 0.0) -> None:
         """Begin empty; `drift_rad_s`: of unstated headings, `late_us`: added to stamps."""
         self.counts, self._drift_rad_s, self._late_ns = counts, drift_rad_s, round(1e3 * late_us)
-        kept = 512  # half a second of the fastest sensors; epochs lie at most two camera periods behind
-        self._samples: deque[_Sample] = deque(maxlen=kept)
+        self._samples: deque[_Sample] = deque(maxlen=round(DEFAULT.samples))
         self._first_ns: int | None = None
 
     def __len__(self) -> int:
@@ -107,7 +107,7 @@ class OrientationSamples:
             self.counts["orientation.not_unit"] += 1
         else:
             if self._samples and t_ns <= (newest_ns := self._samples[-1].t_ns):
-                if newest_ns - t_ns <= REACH_NS:
+                if newest_ns - t_ns <= _REACH_NS:
                     self.counts["orientation.late"] += 1
                     return
                 self._samples.clear()
@@ -130,9 +130,9 @@ class OrientationSamples:
                 before = sample
                 break
             after = sample
-        if before is not None and t_ns - before.t_ns > REACH_NS:
+        if before is not None and t_ns - before.t_ns > _REACH_NS:
             before = None
-        if after is not None and after.t_ns - t_ns > REACH_NS:
+        if after is not None and after.t_ns - t_ns > _REACH_NS:
             after = None
         if before is not None and after is not None:
             a, b = t_ns - before.t_ns, after.t_ns - t_ns
@@ -156,7 +156,6 @@ def slerp(first: Wxyz, second: Wxyz, share: float) -> Wxyz:
     return p * a + q * w, p * b + q * x, p * c + q * y, p * d + q * z
 
 
-SURE_RAD = np.radians(15.0)  # about every axis: better known than this, it determines how the palm lies
 _EYE = np.eye(3)
 
 
@@ -196,19 +195,17 @@ class OrientationTrack:
         if heading_rad is None and near is not None:
             rotation = _twist_about(self._up, near.T_rig_palm[:3, :3] @ rotation.T) @ rotation
         tilt_2 = self._imu.orientation_sigma_rad**2 + (DEFAULT.palm_process_noise_rad_s * found.gap_s) ** 2
-        free_rad = 10.0  # constrains nothing beside any marker
-        about_2 = max((free_rad if heading_rad is None else heading_rad) ** 2, tilt_2)
+        about_2 = max((DEFAULT.heading_free_rad if heading_rad is None else heading_rad) ** 2, tilt_2)
         along = np.outer(self._up, self._up)
         information = _EYE / tilt_2 + (1.0 / about_2 - 1.0 / tilt_2) * along
-        return OrientationMeasurement(rotation, information, sure=about_2 < SURE_RAD**2)
+        return OrientationMeasurement(rotation, information, sure=about_2 < DEFAULT.sure_rad**2)
 
     def _heading_rad(self, drift_rad: float) -> float | None:
         """Standard deviation of the heading after such a drift; None: not known."""
         if self._imu.heading_sigma_rad is None:
             return None
         predicted = hypot(self._imu.heading_sigma_rad, drift_rad)
-        lost_rad = 1.0  # a heading less sure than this may point anywhere (a uniform circle has 1.8)
-        return predicted if predicted < lost_rad else None
+        return predicted if predicted < DEFAULT.heading_lost_rad else None
 
 
 def _twist_about(axis: Float, rotation: Float) -> Float:
@@ -293,15 +290,13 @@ class MarkerPipeline:
         self._joint = np.array([0 if joint is None else joint for joint in joints])  # 0: the palm
         self._stage, self._volume, self._dropped_epochs, self._side = stage, volume, dropped_epochs, side
         self._orientation = None if imu is None or not imu.placed else OrientationTrack(imu, self.counts)
-        silent_frames = 2.2
-        self._silent_ns = round(silent_frames * 1e9 / slowest_hz)
+        self._silent_ns = round(DEFAULT.silent_frames * 1e9 / slowest_hz)
         self._by_cameras_ns: int | None = None
-        self._last_ns = -(2**63)
+        self._last_ns = NEVER_NS
         self._late_ns = {name: round(1e3 * us) for name, us in (stamp_offset_us or {}).items()}
         self._last: Fitted | None = None
         self._was_m = np.full((len(markers), 3), np.nan)
-        never_ns = -(2**62)
-        self._was_ns: Int = np.full(len(markers), never_ns, np.int64)
+        self._was_ns: Int = np.full(len(markers), NEVER_NS, np.int64)
 
     def push(self, message: Detections) -> list[SolvedPose]:
         """Take what one camera saw; return the poses it completes, oldest first."""

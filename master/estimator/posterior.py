@@ -34,6 +34,7 @@ from master.estimator.parameters import Mounts, truncated_mean
 from master.estimator.priors import PosturePrior
 from master.estimator.problem import EpochPrior, Observations, Problem, Rig
 from master.estimator.sensors import CameraArrays
+from master.estimator.settings import KERNEL
 from master.estimator.solve import (
     Blank,
     Hypothesis,
@@ -190,9 +191,8 @@ def _ends(rig: Rig, one: Hypothesis, scratch: Scratch) -> None:
     search, trial, at = scratch.search, scratch.search.trial, one.at
     markers_of(rig.hand, rig.mounts, at.palm, at.x, search.rows, scratch.here)
     moves = False
-    difference_step = 1e-4  # of a step: what a difference is taken over
     for i in range(one.step.shape[0]):
-        search.step[i] = difference_step * one.step[i]
+        search.step[i] = KERNEL.difference * one.step[i]
         moves = moves or one.step[i] != 0.0
     if not moves:
         return
@@ -202,7 +202,7 @@ def _ends(rig: Rig, one: Hypothesis, scratch: Scratch) -> None:
     markers_of(rig.hand, rig.mounts, trial.palm, trial.x, search.rows, scratch.there)
     for m in range(rig.mounts.finger.shape[0]):
         for i in range(3):
-            scratch.here[m, i] += (scratch.there[m, i] - scratch.here[m, i]) / difference_step
+            scratch.here[m, i] += (scratch.there[m, i] - scratch.here[m, i]) / KERNEL.difference
 
 
 @inner
@@ -268,7 +268,7 @@ def posterior(
         out.marker_chi2[m] = scratch.each[best].marker_chi2[m]
 
 
-ON_MARKERS, ON_OTHERS, BY_MARKERS = 1, 2, 16
+ON_MARKERS, ON_OTHERS, BY_MARKERS, _FIRST_MARKER = 1, 2, 16, 8  # bits; of the marker its number
 
 
 class Ground:
@@ -300,14 +300,12 @@ def count_rows(mounts: Mounts, observed: Observations, boxed_out: Any) -> None:
         out.back[0] = out.back[0] or mounts.on_back[m]
         if f >= 0:
             out.sources[f] |= ON_MARKERS | (BY_MARKERS if rays > 1 else 0)
-        first_marker = 8  # bit
-        out.sources[5] |= 1 << (first_marker + m)
+        out.sources[5] |= 1 << (_FIRST_MARKER + m)
     for f in range(5):
         out.shown[f] = out.sources[f] > 0
     back_numbers = 2.0  # a marker on the back measures where that looks, by two angles
     out.numbers[0] += back_numbers if out.back[0] else 0.0
-    palm_by = 3  # markers
-    out.by_markers[0] = out.seen[0] >= palm_by or (out.seen[0] == palm_by - 1 and out.back[0] > 0)
+    out.by_markers[0] = out.seen[0] >= 3 or (out.seen[0] == 2 and out.back[0] > 0)
     if out.by_markers[0]:
         out.sources[5] |= ON_MARKERS | BY_MARKERS
 

@@ -21,7 +21,6 @@ natural curve.
 """
 
 from dataclasses import dataclass, replace
-from math import radians
 from typing import NamedTuple
 
 import numpy as np
@@ -36,7 +35,7 @@ from common.records import boxed, record
 from master.estimator.finger_surface import OWN_MOVES, Surface, laser_centroid, look
 from master.estimator.parameters import HandParameters, HandTables
 from master.estimator.sensors import Device, flexed_palm
-from master.estimator.settings import DEFAULT, Settings
+from master.estimator.settings import DEFAULT, KERNEL, LAWS, Settings
 from master.fabrik.linear_algebra import as_vector
 from master.rig.wrist import WristSetup
 
@@ -82,8 +81,7 @@ def posture_prior_of(
     volume = normal.copy()
     if model.posture is None:
         flexion = np.flatnonzero((parameters.free >= 4) & (parameters.free % 4 == 1))
-        narrowest_rad = 1e-3  # limits that leave an angle no room
-        span = np.maximum(parameters.legal_high - parameters.legal_low, narrowest_rad)[flexion]
+        span = np.maximum(parameters.legal_high - parameters.legal_low, KERNEL.narrowest_rad)[flexion]
         # The highest density of a normal distribution of this width is that of any angle within the span.
         volume[1, flexion, flexion] += 2.0 * np.pi / span**2
     share = np.log([settings.natural_prior_weight, 1.0 - settings.natural_prior_weight])
@@ -179,9 +177,10 @@ def principal_line(points_m: Float) -> FingerLine:
         FitError: Fewer than five points, less than 5 mm of motion, or points on no line.
     """
     points = points_m[np.isfinite(points_m).all(axis=1)]
-    min_points = 5
-    if len(points) < min_points:
-        raise FitError(f"finger line: {len(points)} points of the laser, at least {min_points} are needed")
+    if len(points) < LAWS.line_points:
+        raise FitError(
+            f"finger line: {len(points)} points of the laser, {LAWS.line_points} or more are needed"
+        )
     mean = points.mean(axis=0)
     off = points - mean
     direction = np.linalg.svd(off, full_matrices=False)[2][0]
@@ -192,13 +191,11 @@ def principal_line(points_m: Float) -> FingerLine:
         direction, along = -direction, -along
     residual = float(np.sqrt(((off - along[:, None] * direction) ** 2).sum(axis=1).mean()))
     low, high = float(along.min()), float(along.max())
-    min_range_m = 5e-3  # below this the direction is that of the noise
-    if high - low < min_range_m:
+    if high - low < LAWS.line_range_m:
         raise FitError(
             f"finger line: the laser's point moved by {1e3 * (high - low):.1f} mm only: bend the finger fully"
         )
-    straight = 0.25  # residual per range above which it is a cloud and no line
-    if residual > straight * (high - low):
+    if residual > LAWS.line_straight * (high - low):
         raise FitError(
             f"finger line: the points deviate {1e3 * residual:.1f} mm from a line of {1e3 * (high - low):.1f} mm:"
             " only this finger should move"
@@ -224,7 +221,6 @@ def on_line(points_m: Float, line: FingerLine) -> tuple[Float, Float]:
 
 
 PIP, DIP = 2, 3
-FULL_CURL_RAD = radians(120.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -245,9 +241,9 @@ class FlexionSynergy:
         per_pip[1:, FLEXION] = digits.mcp_per_pip if mcp is None else mcp
         per_pip[1:, DIP] = digits.dip_per_pip if dip is None else dip
         per_pip[:, PIP] = 1.0
-        range_rad[1:] = 0.0, FULL_CURL_RAD
+        range_rad[1:] = 0.0, LAWS.closed_rad
         low, high = model.limits_rad[0, 1:].T
-        span = np.maximum(high - low, 1e-3)
+        span = np.maximum(high - low, KERNEL.narrowest_rad)
         per_pip[0, 1:] = span / span[1]
         base[0, 1:] = low - low[1] * per_pip[0, 1:]
         range_rad[0] = low[1], low[1] + span[1]
@@ -260,14 +256,10 @@ class FlexionSynergy:
         return angles
 
 
-ROOT_MM = 102.06
-_POLYNOMIAL = (-0.0003, 0.059, -4.07, 119.75)
-
-
 def cubic_pip(distance_m: Float) -> Float:
     """Return the PIP angle [rad] by the printed law, clamped outside its range."""
-    d = np.clip(1e3 * distance_m, 0.0, ROOT_MM)
-    return np.radians(np.clip(np.polyval(_POLYNOMIAL, d), 0.0, _POLYNOMIAL[-1]))
+    d = np.clip(1e3 * distance_m, 0.0, LAWS.cubic_mm)
+    return np.radians(np.clip(np.polyval(LAWS.cubic, d), 0.0, LAWS.cubic[-1]))
 
 
 @kernel
@@ -299,10 +291,8 @@ def simulated_lines(setup: WristSetup) -> tuple[FingerLine, ...]:
 
 def _curl(setup: WristSetup, synergy: FlexionSynergy) -> Float:
     """Return laser points (C, 5, 3) [m] of a hand that closes; NaN: missed."""
-    model = setup.model
-    curls = 31
-    branch = 0.75  # of a curl: after that the last phalanx folds into the light, and the line jumps to it
-    share = np.linspace(0.0, branch, curls)[:, None]
+    model, curls = setup.model, LAWS.curls
+    share = np.linspace(0.0, LAWS.curl_share, curls)[:, None]
     curl = synergy.range_rad[:, 0] + share * (synergy.range_rad[:, 1] - synergy.range_rad[:, 0])
     angles = synergy.angles(curl, np.zeros_like(curl)).reshape(curls, 20)
     points = np.empty((curls, 5, 3))
@@ -325,12 +315,6 @@ class CubicLaw:
             along, _ = on_line(points_m[f], line)
             pip[f] = cubic_pip((1.0 - along) * (line.range_m[1] - line.range_m[0]))
         return pip
-
-
-_DIP_PER_PIP = 0.5 * (2.0 / 3.0 + 0.84)  # between the ratios of both papers
-_ASIDE_RAD = radians(25.0)
-_BEYOND_RAD = radians(8.0)  # of limits: those of a hand file are a prior's, not a wall's
-_DIP_SPREAD_RAD = radians(7.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -357,9 +341,8 @@ class WristModel:
         synergy, optics = FlexionSynergy.of(setup.model), setup.optics
         per_pip = synergy.per_pip.copy()
         if setup.model.profile.couplings is None and setup.solver_mode != "fk":
-            per_pip[1:, DIP] = _DIP_PER_PIP
-        ip_per_mcp = 1.1  # of thumbs: between those of grasps and the ratio of the limits
-        per_pip[0, DIP] = ip_per_mcp
+            per_pip[1:, DIP] = LAWS.dip_per_pip
+        per_pip[0, DIP] = LAWS.ip_per_mcp
         base_rad = synergy.base_rad.copy()
         base_rad[0, DIP] = 0.0
         if not lit(setup, synergy):
@@ -370,8 +353,7 @@ class WristModel:
         size = np.array([optics.width_px, optics.height_px])
         centre = np.array([optics.matrix[0, 2], optics.matrix[1, 2]])
         focal = np.array([optics.matrix[0, 0], optics.matrix[1, 1]])
-        inside_px = 20.0  # from the edge of the image: a fingertip there is clearly in it
-        low, high = (inside_px - centre) / focal, (size - inside_px - centre) / focal
+        low, high = (LAWS.inside_px - centre) / focal, (size - LAWS.inside_px - centre) / focal
         return cls(
             Device.of(setup),
             base_rad,
@@ -388,13 +370,13 @@ class WristModel:
 def loosened(model: HandModel) -> HandModel:
     """Return the hand with loosely following DIPs and room beyond its limits."""
     limits = model.limits_rad.copy()
-    limits[1:, ABDUCTION] = -_ASIDE_RAD, _ASIDE_RAD
-    limits[1:, [FLEXION, PIP, DIP], 0] -= _BEYOND_RAD
-    limits[1:, [FLEXION, PIP, DIP], 1] += _BEYOND_RAD
+    limits[1:, ABDUCTION] = -LAWS.abduction_rad, LAWS.abduction_rad
+    limits[1:, [FLEXION, PIP, DIP], 0] -= LAWS.beyond_rad
+    limits[1:, [FLEXION, PIP, DIP], 1] += LAWS.beyond_rad
     ratio = model.dip_per_pip
     if model.profile.couplings is None:
-        ratio = _DIP_PER_PIP
-    spread = max(model.dip_spread_rad, _DIP_SPREAD_RAD)
+        ratio = LAWS.dip_per_pip
+    spread = max(model.dip_spread_rad, LAWS.dip_spread_rad)
     return replace(
         model, tolerance_rad=np.zeros((5, 4)), limits_rad=limits, dip_per_pip=ratio, dip_spread_rad=spread
     )

@@ -44,7 +44,7 @@ from master.estimator.sensors import (
     flexed_palm,
     project,
 )
-from master.estimator.settings import Settings
+from master.estimator.settings import KERNEL, Settings
 from master.fabrik.linear_algebra import inverse_3
 
 
@@ -167,7 +167,7 @@ def _ray(cameras: CameraArrays, observed: Observations, c: int, m: int, point: F
     """Add one RAY row to information and gradient by place; return half chi square."""
     J, g, H = work.J, work.g, work.H
     if not project(cameras, c, point, work.uv, J):
-        return 1e4  # half chi square of a marker behind a camera that sees it
+        return KERNEL.behind_chi2
     w, r0, r1 = observed.weight[c, m], work.uv[0] - observed.uv[c, m, 0], work.uv[1] - observed.uv[c, m, 1]
     for a in range(3):
         g[a] += w * (J[0, a] * r0 + J[1, a] * r1)
@@ -278,8 +278,7 @@ def rotation_vector_jacobian(rotation: Float, J: Float) -> None:
     The inverse of the left Jacobian of SO(3) (Sola, Deray, Atchuthan 2018, "A micro Lie theory", eq. 146).
     """
     squared = rotation[0] * rotation[0] + rotation[1] * rotation[1] + rotation[2] * rotation[2]
-    small_rad = 1e-4  # below it a rotation vector counts as so long in the derivative
-    angle = max(sqrt(squared), small_rad)
+    angle = max(sqrt(squared), KERNEL.small_rad)
     factor = 1.0 / (angle * angle) - 0.5 / (angle * tan(0.5 * angle))
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3

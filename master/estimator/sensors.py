@@ -24,6 +24,7 @@ from common.hand.model import Fingertips
 from common.hand.skin import PLACES, SPREAD, PalmarSurface
 from common.kernels import inlined, inner, kernel
 from common.records import array, filled, record
+from master.estimator.settings import KERNEL
 from master.rig.wrist import WristSetup
 
 
@@ -109,8 +110,7 @@ def undistort(cameras: CameraArrays, c: int, u: float, v: float, out: Float) -> 
     seen_x = (u - cameras.principal[c, 0]) / cameras.focal[c, 0]
     seen_y = (v - cameras.principal[c, 1]) / cameras.focal[c, 1]
     x, y = seen_x, seen_y
-    newton_steps = 12
-    for _ in range(newton_steps):
+    for _ in range(KERNEL.lens_steps):
         there_x, there_y, a, b, d, radial = _through_lens(cameras, c, x, y)
         off_x, off_y = seen_x - there_x, seen_y - there_y
         determinant = a * d - b * b
@@ -185,7 +185,6 @@ class PlaneAxes:
 
 TWIST, WRIST_ANGLES, RATE, TILT, HEADING, LED_SCALE, EXTRAS = 0, 5, 7, 9, 11, 12, 13
 NO_EXTRAS = 1  # of a rig without wrist device: one that means nothing
-_PALM_M = 7e-4  # what calibration leaves of plane and palm: a palm pitched by 0.2 degrees, and 0.3 mm
 
 
 class Device:
@@ -236,7 +235,7 @@ class Device:
             back=back,
             tip=last * (1.0 + tips.beyond_m / length)[:, None] + tips.dorsal_m * back[:, 2],
             surface2=(SPREAD * surface.palmar_m.mean(axis=1)) ** 2,
-            tip2=(SPREAD * tips.beyond_m) ** 2 + _PALM_M**2,
+            tip2=(SPREAD * tips.beyond_m) ** 2 + KERNEL.palm_m**2,
         )
 
 
@@ -299,8 +298,7 @@ def loosen_short(
     """
     seen_px = cycle_rows.laser_px[f]
     x, y = cycle_rows.laser[f, 0], cycle_rows.laser[f, 1]
-    whole = 0.85  # of the line that is expected: a shorter one is hidden in part
-    if seen_px == 0.0 or seen_px > whole * length_px or not on_plane(device, x, y, point, A):
+    if seen_px == 0.0 or seen_px > KERNEL.whole * length_px or not on_plane(device, x, y, point, A):
         return False
     W = cycle_rows.laser_W[f]
     a, b, c = _covariance(W)
@@ -363,8 +361,8 @@ def observe_wrist(boxed_device: Any, seen: WristRows, depth_sigma: float, boxed_
         if np.isfinite(x + y + laser_sigma_px[f]) and on_plane(device, x, y, point, A):
             blur_px = 0.5
             sensed = (laser_sigma_px[f] ** 2 + blur_px**2) / device.focal[0] ** 2
-            across = 0.25 * device.surface2[f] + _PALM_M**2
-            along = device.surface2[f] + _PALM_M**2
+            across = device.surface2[f] / 4.0 + KERNEL.palm_m**2
+            along = device.surface2[f] + KERNEL.palm_m**2
             a = sensed + A[0, 0] ** 2 * across + A[0, 1] ** 2 * along
             b = A[0, 0] * A[1, 0] * across + A[0, 1] * A[1, 1] * along
             c = sensed + A[1, 0] ** 2 * across + A[1, 1] ** 2 * along
@@ -373,9 +371,8 @@ def observe_wrist(boxed_device: Any, seen: WristRows, depth_sigma: float, boxed_
             out.laser_px[f] = seen.laser_px[f] if seen.laser_px[f] > 0.0 else 0.0
         x, y = tip[f, 0], tip[f, 1]
         if np.isfinite(x + y + tip_sigma_px[f]):
-            assumed_m = 0.1  # a fingertip of which no laser point measures the distance
-            near = point[2] if out.lit[f] > 0.0 else assumed_m
-            variance = (tip_sigma_px[f] / device.focal[0]) ** 2 + device.tip2[f] / near**2
+            away = point[2] if out.lit[f] > 0.0 else KERNEL.assumed_m
+            variance = (tip_sigma_px[f] / device.focal[0]) ** 2 + device.tip2[f] / away**2
             inverse_2(variance, 0.0, variance, out.tip_W[f])
             out.tip[f, 0], out.tip[f, 1], out.shown[f], out.rows[0] = x, y, 1.0, 1.0
             if depth_sigma > 0.0 and seen.tip_depth[f] > 0.0:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field, fields, replace
 from math import isfinite, radians
-from typing import Self, cast
+from typing import NamedTuple, Self, cast
 
 import numpy as np
 
@@ -136,6 +136,9 @@ class Settings:
     # Gates.
     marker_gate: float = _gate(16.3, 5.0, 50.0, _CHI + " of three numbers, 1 in 1000")
     misled: float = _gate(32.6, 5.0, 200.0, "twice that: another hand explains the markers better")
+    sure_palm_rad: float = _deg(5.0, 0.01, 0.5, "about each axis: a palm that markers determine well")
+    sure_rad: float = _deg(15.0, 0.01, 1.0, "about every axis: better known than this, it determines the palm")
+    lost_m: float = _m(0.1, 0.01, 1.0, "about each axis: a hand that is known no better than this is lost")
     forget_s: float = _s(0.5, 0.05, 10.0, "after so long without a marker nothing is known of the hand")
     tracked_m: float = _m(0.022, 0.002, 0.1,
         "half the largest axis of the 95 % region of a joint that is TRACKED")
@@ -143,8 +146,22 @@ class Settings:
     tracked_age_s: float = _s(0.03, 0.0, 1.0, "how old the newest measurement of a TRACKED finger may be")
     tracked_cycle_s: float = _s(0.055, 0.0, 1.0,
         "the same where a wrist device measured it, whose strobe cycles come at 30 Hz")
-    # What is shown.
+    # What is shown; `led`: of a hand that several kinds of sensors watch.
     blend_s: float = _s(0.1, 0.01, 1.0, "as long as a leap is seen as a motion")
+    led_leap_m: float = _m(3e-3, 1e-4, 0.1, "from one epoch to the next, beside motion")
+    led_step_m: float = _m(5e-3, 1e-4, 0.1, "the most that is led between two poses")
+    led_off_m: float = _m(1e-3, 1e-5, 0.1, "a part that is led by more is not yet where its markers are")
+    led_stale_s: float = _s(0.1, 0.01, 1.0, "after such a gap nothing of a speed is left")
+    led_fades_s: float = _s(0.04, 0.001, 1.0, "in which the last of what is led fades")
+    led_speed_s: float = _s(0.03, 0.001, 1.0, "memory of the speed of the shown hand, which is smooth")
+    # A hand that begins anew.
+    begin_mcp_per_pip: float = _number(0.6, 0.0, 1.5, "of hands from which a search begins; " + _HANDS)
+    begin_above_m: float = _m(0.05, 0.005, 0.5, "a point above the wrist stands for where the back faces")
+    begin_above_weight: float = _number(0.3, 0.0, 10.0, "of that point")
+    begin_palm_weight: float = _number(3.0, 0.1, 100.0, "of markers on the palm, by those on fingers")
+    line_width_m: float = _m(5e-3, 1e-4, 0.05, "markers nearer to one line do not turn a hand about it")
+    line_length_m: float = _m(20e-3, 1e-3, 0.1, "a shorter line of markers has no direction")
+    line_across: float = _number(0.9, 0.1, 1.0, "most cosine of a line of markers to the line of sight")
     # Fingers that a wrist device sees.
     dip_rad: float = _deg(3.0, 0.005, 1.0, "of a DIP about its share of the PIP, of straight fingers")
     dip_share: float = _number(0.13, 0.01, 1.0, "and by so much of the PIP more; the papers' ratios")
@@ -187,10 +204,30 @@ class Settings:
     calibrated_palm_rad: float = _deg(1.0, 0.001, 0.5, "of a palm that was calibrated before its device")
     wrist_share: float = _number(0.6, 0.0, 1.0,
         "of what fingers measure of the wrist's bend: they err together")
+    stiff_rad: float = _deg(1.0, 0.01, 0.5, "of fingers that are taken to bend as their PIP does")
+    bent_rad: float = _deg(45.0, 0.1, 1.5, "PIP of one of the half bent fingers of `coupled_fingers`")
+    stands_m: float = _m(1e-4, 1e-6, 1e-2, "of a palm before the wrist device alone, whose frame is the rig's")
+    stands_rad: float = _setting(1e-3, "rad", 1e-5, 0.1, "the same, of its turn")
     strap_rad: float = _deg(1.5, 0.001, 0.5, "of a palm by markers, and of how IMU and camera are mounted")
     wrist_rate_1_s: float = _setting(1.5, "1/s", 0.1, 30.0, "of wrists; Hansson et al. 2009")
     wrist_mean_s: float = _s(20.0, 1.0, 600.0, "as long as a posture of the wrist is kept")
     tilt_s: float = _s(5.0, 0.1, 600.0, "as long as an IMU has the vertical off")
+    tilt_least_rad: float = _setting(1e-3, "rad", 1e-6, 0.1, "of any IMU's vertical")
+    constant_s: float = _s(1e4, 1.0, 1e6, "correlation time of what is constant")
+    long_s: float = _s(10.0, 0.1, 100.0, "an epoch owes nothing to one so long before")
+    sample_reach_s: float = _s(0.05, 1e-3, 1.0, "farther from an epoch a sample of an IMU does not constrain it")
+    samples: float = _number(512.0, 16.0, 1e5, "of an IMU that are kept: half a second of the fastest")
+    heading_free_rad: float = _setting(10.0, "rad", 3.0, 100.0, "constrains nothing beside any marker")
+    heading_lost_rad: float = _setting(1.0, "rad", 0.1, 1.8, "less sure it may be any: a uniform circle has 1.8")
+    heading_least_rad_s: float = _deg(0.2, 1e-4, 0.1, "what a heading walks in a second at least")
+    heading_most_rad_s: float = _deg(5.0, 1e-3, 1.0, "and at most, unless evenly")
+    restarted_s: float = _s(0.25, 0.01, 10.0, "silence of an IMU that begins anew, until it has the vertical")
+    contrary_s: float = _s(0.5, 0.01, 10.0, "what contradicts an IMU for longer is right")
+    contrary_palms: float = _number(5.0, 1.0, 100.0, "if it does so as often")
+    silent_frames: float = _number(2.2, 1.0, 100.0, "without an epoch strobe cycles lead")
+    cycles: float = _number(8.0, 1.0, 1000.0, "strobe cycles that may wait for an epoch")
+    cycle_age_s: float = _s(0.07, 0.01, 1.0, "an older strobe cycle constrains no finger now")
+    cycle_apart_s: float = _s(0.017, 1e-3, 1.0, "half a period: a strobe cycle of an unrelated epoch")
     errs_s: float = _s(0.5, 0.01, 60.0, "as long as errors of shape and skin stay")
     wrist_errs_s: float = _s(0.05, 0.001, 60.0,
         "as long as errors of a palm by markers stay, of what a wrist moves meanwhile")
@@ -249,3 +286,84 @@ class Settings:
 
 
 DEFAULT = Settings()
+
+
+class KernelSettings(NamedTuple):
+    """Numbers that kernels have compiled in, and the laws of fingers.
+
+    numba sees no change of another file: after one of these, delete the `__pycache__` of this room and of
+    `master.fabrik`.
+    """
+
+    # Covariance.
+    region_95: float = 7.815  # chi square of three numbers, 95 %
+    rotations: int = (
+        12  # turns that count in arcs: those of the palm, which moves all joints, then the largest
+    )
+    # The search.
+    steps: int = 25
+    first_damping: float = 1e-3
+    most_damping: float = 1e6
+    difference: float = 1e-4  # of a step: what a difference is taken over
+    behind_chi2: float = 1e4  # half chi square of a marker behind a camera that sees it
+    small_rad: float = 1e-4  # a shorter rotation vector counts as so long in the derivative
+    lens_steps: int = 12  # of Newton, from a pixel to its ray
+    # Limits.
+    tolerances: float = 3.0  # standard deviations beyond a limit, where there is no hand
+    narrowest_rad: float = 1e-3  # limits that leave an angle no room
+    anywhere_m: float = 0.1  # of a hand in front of cameras, before anything is seen of it; its turn: 1 rad
+    tail: float = 30.0  # standard deviations, beyond which the normal distribution underflows
+    sweeps: int = 6  # of expectation propagation
+    sweep_share: float = 0.8  # of a change that each makes
+    # Fingers along their PIPs.
+    nodes: int = 16
+    fine: int = 4  # steps of a density from node to node
+    tried_rad: tuple[float, float, float, float] = (0.15, 0.6, 1.05, 1.4)  # flexions
+    tried_every: int = 5  # nodes
+    steps_from_node: int = 3  # from the pose of the node before
+    steps_from_tried: int = 5
+    step_rad: float = 0.3  # the most of one step
+    rolled_rad: float = 0.25  # no hinges are askew by more
+    hidden_m: float = 1.5e-3  # of a fingertip behind the skin that the camera sees: its own roundness
+    # The laser on the skin.
+    rays: int = 16
+    pulled_in: float = 0.77  # mean of a cosine over the half circle that faces the light
+    cap_along: float = 0.7  # radii from the last sphere to where the skin turns away
+    cap_out: float = 0.5
+    level: float = 0.05  # a chain less inclined to the plane slides along it without an end
+    prolonged: float = (
+        6.0  # lengths of its last stretch that a chain which ends before the plane is prolonged
+    )
+    span_crossed: float = 1.3  # of the radius: where a cone that crosses the plane may be lit
+    span_cut: float = 1.1  # of half the cut of a sphere
+    chord: float = 0.5  # of the finger's breadth that one chord may span: more is a jump from part to part
+    seen_m: float = 3e-4  # a lit point this near behind the first the camera sees is seen
+    nearest_m: float = 1e-3  # of a fingertip to the camera
+    whole: float = 0.85  # of the line that is expected: a shorter one is hidden in part
+    assumed_m: float = 0.1  # distance of a fingertip of which no laser point measures it
+    palm_m: float = (
+        7e-4  # what calibration leaves of plane and palm: a palm pitched by 0.2 degrees, and 0.3 mm
+    )
+
+
+class FingerLaws(NamedTuple):
+    """How fingers bend, where it is no prior of a hand's own."""
+
+    begin_pip_rad: tuple[float, ...] = (0.1, 0.7, 1.3)  # from which a search begins: open to closed
+    closed_rad: float = radians(120.0)  # PIP
+    cubic_mm: float = 102.06  # range of Digits' printed law
+    cubic: tuple[float, ...] = (-0.0003, 0.059, -4.07, 119.75)
+    curls: int = 31  # poses of a simulated curl
+    curl_share: float = 0.75  # after that the last phalanx folds into the light, and the line jumps to it
+    line_points: int = 5  # of the laser on one finger that make a line
+    line_range_m: float = 5e-3  # below this the direction is that of the noise
+    line_straight: float = 0.25  # residual per range above which it is a cloud and no line
+    dip_per_pip: float = 0.5 * (2.0 / 3.0 + 0.84)  # between the ratios of both papers
+    dip_spread_rad: float = radians(7.0)
+    ip_per_mcp: float = 1.1  # of thumbs: between those of grasps and the ratio of the limits
+    abduction_rad: float = radians(25.0)  # limit, to both sides
+    beyond_rad: float = radians(8.0)  # other limits: those of a hand file are a prior's, not a wall's
+    inside_px: float = 20.0  # from the edge of the image: a fingertip there is clearly in it
+
+
+KERNEL, LAWS = KernelSettings(), FingerLaws()

@@ -47,9 +47,10 @@ from master.estimator.kinematics import (
 from master.estimator.parameters import HandParameters, HandTables, Mounts
 from master.estimator.posterior import BY_MARKERS
 from master.estimator.settings import DEFAULT, Settings
-from master.estimator.state import NEVER_NS, PALM_PART
+from master.estimator.state import PALM_PART
 from master.fabrik.linear_algebra import copy
-from master.fabrik.one_euro import UNSEEN_NS, OneEuroParameters, filter_step, measure
+from master.fabrik.one_euro import OneEuroParameters, filter_step, measure
+from master.fabrik.settings import NEVER_NS
 
 PLACE, ROTATION, ANGLES = slice(0, 3), slice(3, 6), slice(6, 26)
 PARTS: Int = np.repeat([5, 0, 1, 2, 3, 4], [6, 4, 4, 4, 4, 4])  # signal -> finger, or 5: the palm
@@ -58,9 +59,9 @@ PARTS: Int = np.repeat([5, 0, 1, 2, 3, 4], [6, 4, 4, 4, 4, 4])  # signal -> fing
 class Blend:
     """Push machine that holds what is left of jumps, by palm and finger."""
 
-    def __init__(self, blend_m_s: float, on_palm: Bool) -> None:
+    def __init__(self, blend_m_s: float, on_palm: Bool, settings: Settings) -> None:
         """Blend no faster than a speed [m/s]; `on_palm` (M,): markers on the back."""
-        self._blend_m_s, self._on_palm = blend_m_s, on_palm
+        self._blend_m_s, self._on_palm, self._settings = blend_m_s, on_palm, settings
         self._offset, self._speed = np.zeros(26), np.zeros(26)
         self._sources = np.zeros(6, np.int64)
         self._points_m = np.full((len(on_palm), 3), np.nan)
@@ -73,32 +74,28 @@ class Blend:
         """
         if gap_s > 0.0:
             # of it: a motion that is not seen any more rather ends than goes on
-            stale_s = 0.1  # after such a gap nothing of a speed is left
-            goes_on = shown + 0.5 * min(gap_s, stale_s) * self._speed
+            s = self._settings
+            goes_on = shown + 0.5 * min(gap_s, s.led_stale_s) * self._speed
             went = (points_m - self._points_m)[self._on_palm]
             went = went[np.isfinite(went[:, 0])]
-            if len(went) and gap_s <= stale_s:
+            if len(went) and gap_s <= s.led_stale_s:
                 goes_on[PLACE] = shown[PLACE] + went.mean(axis=0)
             off = np.sqrt(np.bincount(PARTS, np.square(goes_on - solved - self._offset)))
             triangulated = (sources & self._sources & BY_MARKERS) > 0
-            blended_m, nothing_m = 1e-3, 1e-5  # a part that is led by more is not yet where its markers are
-            led = np.bincount(PARTS, np.abs(self._offset)) > blended_m
-            sudden_m = 3e-3  # from one epoch to the next, beside motion
-            leaps = ((sources != self._sources) | ~triangulated | led) & (off > sudden_m)
+            led = np.bincount(PARTS, np.abs(self._offset)) > s.led_off_m
+            leaps = ((sources != self._sources) | ~triangulated | led) & (off > s.led_leap_m)
             self._offset = np.where(leaps[PARTS], goes_on - solved, self._offset)
-            size_m = np.maximum(np.bincount(PARTS, np.abs(self._offset)), nothing_m)
-            step_m = 5e-3  # is the most that is led between two poses
-            left = 1.0 - min(self._blend_m_s * gap_s, step_m) / size_m
-            ease_s = 0.04  # in which the last of what is led fades
-            self._offset = self._offset * np.maximum(left, exp(-gap_s / ease_s))[PARTS]
+            size_m = np.maximum(np.bincount(PARTS, np.abs(self._offset)), 1e-6)  # no division by 0
+            left = 1.0 - min(self._blend_m_s * gap_s, s.led_step_m) / size_m
+            self._offset = self._offset * np.maximum(left, exp(-gap_s / s.led_fades_s))[PARTS]
         self._sources, self._points_m = sources, points_m
         return self._offset
 
     def moved(self, gap_s: float, step: Float) -> None:
         """Learn from the step (26,) [m] of what was shown."""
         if gap_s > 0.0:
-            speed_s = 0.03  # of the shown hand, which is smooth
-            self._speed = self._speed + (1.0 - exp(-gap_s / speed_s)) * (step / gap_s - self._speed)
+            new = 1.0 - exp(-gap_s / self._settings.led_speed_s)
+            self._speed = self._speed + new * (step / gap_s - self._speed)
 
 
 WHOLE, SIGNALS, REST = constant(0), constant(1), constant(2)
@@ -171,7 +168,7 @@ def _begun(
         until_ns=NEVER_NS,
         since_ns=NEVER_NS,
         part_of=PARTS,
-        seen_ns=UNSEEN_NS,
+        seen_ns=NEVER_NS,
         filter=parameters.array(),
         marker_of=[fingers.index(f) if f in fingers else -1 for f in range(5)],
         knuckle=knuckle,
@@ -386,7 +383,9 @@ class HandOneEuro:
         gap_s = (t_ns - int(self._t_ns[0])) * 1e-9
         if gap_s > self._settings.forget_s or (hand.reinitialised and self._blend_m_s is None):
             self._state[:], gap_s = self._fresh, 0.0
-            self._blend = None if self._blend_m_s is None else Blend(self._blend_m_s, self._on_palm)
+            self._blend = (
+                None if self._blend_m_s is None else Blend(self._blend_m_s, self._on_palm, self._settings)
+            )
         elif gap_s <= 0.0:
             return hand
         at = solution.joints

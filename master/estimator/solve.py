@@ -39,9 +39,8 @@ from master.estimator.problem import (
     orientation_row,
 )
 from master.estimator.sensors import EXTRAS, WRIST_ANGLES, flexed_palm
+from master.estimator.settings import KERNEL
 from master.fabrik.linear_algebra import cholesky, copy, substitute
-
-MAX_ITERATIONS = 25
 
 
 @inlined
@@ -275,9 +274,8 @@ def descend(
     """
     hand, trial, n, K = problem.rig.hand, search.trial, at.x.shape[0], at.z.shape[0]
     cost = linearise(problem, h, at, search)
-    first_damping, most_damping = 1e-3, 1e6
-    damping, growth, iterations = first_damping, 2.0, 0
-    while iterations < MAX_ITERATIONS and damping <= most_damping:
+    damping, growth, iterations = KERNEL.first_damping, 2.0, 0
+    while iterations < KERNEL.steps and damping <= KERNEL.most_damping:
         iterations += 1
         hoped = _step(hand, damping, at, search)
         least_gain = tolerance + share * cost
@@ -290,9 +288,8 @@ def descend(
         for i in range(K):
             trial.z[i] = at.z[i] + search.step[6 + n + i]
         for i in range(5 if K == EXTRAS else 0):
-            rolled_rad = 0.25  # no hinges are askew by more
-            trial.z[i] = min(max(trial.z[i], -rolled_rad), rolled_rad)
-        if damping <= first_damping and hoped < least_gain:
+            trial.z[i] = min(max(trial.z[i], -KERNEL.rolled_rad), KERNEL.rolled_rad)
+        if damping <= KERNEL.first_damping and hoped < least_gain:
             copy_hand(trial, at)
             break
         there = linearise(problem, h, trial, search)

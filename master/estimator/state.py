@@ -39,8 +39,8 @@ from master.estimator.problem import EpochPrior
 from master.estimator.sensors import EXTRAS, HEADING, LED_SCALE, RATE, TILT, WRIST_ANGLES
 from master.estimator.settings import Settings
 from master.fabrik.linear_algebra import cholesky, copy, inverse, substitute
+from master.fabrik.settings import NEVER_NS
 
-NEVER_NS = -(2**61)
 _NONE = constant(0)
 PALM_PART = 5  # behind the five fingers
 
@@ -277,7 +277,7 @@ def stationary_of(settings: Settings, *, loose: bool, tilt_rad: float) -> Float:
     )
     stationary[WRIST_ANGLES : WRIST_ANGLES + 2] = wrist_angles**2
     stationary[RATE : RATE + 2] = (settings.wrist_rate_1_s * wrist_angles) ** 2
-    stationary[TILT : TILT + 2] = max(tilt_rad, 1e-3) ** 2
+    stationary[TILT : TILT + 2] = max(tilt_rad, settings.tilt_least_rad) ** 2
     stationary[HEADING] = np.pi**2 / 3.0
     stationary[LED_SCALE] = settings.led_scale**2
     return stationary
@@ -285,8 +285,7 @@ def stationary_of(settings: Settings, *, loose: bool, tilt_rad: float) -> Float:
 
 @inlined
 def _correlation_time(settings: Settings, i: int) -> float:
-    constant_s = 1e4
-    return settings.tilt_s if TILT <= i < TILT + 2 else constant_s
+    return settings.tilt_s if TILT <= i < TILT + 2 else settings.constant_s
 
 
 @inner
@@ -375,7 +374,7 @@ def keep_extras(
     for i in range(K):
         # What the palm and what fingers constrain are two blocks: within one, as much is new of everything.
         errs_s = settings.wrist_errs_s if WRIST_ANGLES <= i < LED_SCALE else settings.errs_s
-        new[i] = 1.0 - exp(-min(dt_s, 10.0) / errs_s)
+        new[i] = 1.0 - exp(-min(dt_s, settings.long_s) / errs_s)
         for j in range(K):
             A[i, j] = cov[first + i, first + j] / scale
     if not cholesky(A, K, scratch.L):
@@ -397,6 +396,6 @@ def keep_extras(
         state.z[i] = epoch_prior.z[i]
         for j in range(K):
             state.z[i] += P[i, j] * scratch.M[1, j]
-    share = 1.0 - exp(-min(dt_s, 10.0) / settings.wrist_mean_s)
+    share = 1.0 - exp(-min(dt_s, settings.long_s) / settings.wrist_mean_s)
     for b in range(2):
         state.wrist_mean_rad[b] += share * (state.z[WRIST_ANGLES + b] - state.wrist_mean_rad[b])

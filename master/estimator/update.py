@@ -25,9 +25,10 @@ from master.estimator.problem import (
 from master.estimator.sensors import EXTRAS
 from master.estimator.settings import Settings
 from master.estimator.solve import Blank, descend, likelier
-from master.estimator.state import NEVER_NS, PALM_PART, HandState, grow, keep_extras, predict
+from master.estimator.state import PALM_PART, HandState, grow, keep_extras, predict
 from master.estimator.wrist_update import extras_only, start_scanned, take_scanned
 from master.fabrik.linear_algebra import copy, inverse_3
+from master.fabrik.settings import NEVER_NS
 
 _SOLVED, _MEASURED, _HELD, _WRIST = (
     int(source) for source in (Source.SOLVED, Source.MEASURED, Source.HELD, Source.WRIST)
@@ -300,8 +301,7 @@ def take_over_epoch(
     _depth_noise(settings, state, t_ns, space.ground, space.epoch_prior, out)
     state.t_ns[0], state.known[0], state.natural_weight[0] = t_ns, True, found.natural_weight[0]
     copy(found.palm, state.palm)
-    long_s = 10.0
-    since_s = dt_s if goes_on else long_s  # what begins owes nothing to an epoch before
+    since_s = dt_s if goes_on else settings.long_s
     keep_extras(settings, state, since_s, space.epoch_prior, found.z, found.cov, found.scale[0], space.extras)
     _take_rotation(state, space.epoch_prior, space.scratch.search)
     _take_measured(hand, settings, state, task, space.ground, space.scan, t_ns)

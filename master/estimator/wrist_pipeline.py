@@ -44,7 +44,6 @@ from master.estimator.epoch import (
 from master.estimator.estimator import Estimator, pose_of
 from master.estimator.kinematics import quaternions
 from master.estimator.pipeline import (
-    SURE_RAD,
     Between,
     OrientationSamples,
     SolvedPose,
@@ -55,12 +54,10 @@ from master.estimator.posterior import ON_MARKERS
 from master.estimator.priors import WristModel, loosened
 from master.estimator.sensors import HEADING, TILT, WRIST_ANGLES, WristRows
 from master.estimator.settings import DEFAULT, Settings
+from master.fabrik.settings import NEVER_NS
 from master.rig.wrist import WristSetup
 
 ANYWHERE_RAD = pi / sqrt(3.0)  # standard deviation of a uniform circle
-LOST_RAD = 1.0  # a heading less sure than this may point anywhere
-# [rad^2/s] a heading walks at least and, unless evenly, at most
-_PROCESS_NOISE2, _MOST2 = np.radians([0.2, 5.0]) ** 2
 _EYE = np.eye(3)
 _WRIST = slice(WRIST_ANGLES, WRIST_ANGLES + 2)
 NO_WORLD = np.full(4, np.nan), np.full(2, np.nan)
@@ -104,8 +101,7 @@ class Forearm:
         if isnan(sum(wxyz.tolist())):
             return
         silent_s = 1e-9 * abs(t_ns - self._sample_ns)
-        restarted_s = 0.25  # an IMU that begins anew is silent for longer, until it knows where up is
-        if silent_s > restarted_s and heading_sigma_rad < self._sample_drift_rad:
+        if silent_s > DEFAULT.restarted_s and heading_sigma_rad < self._sample_drift_rad:
             # A drift does not shrink in silence: the IMU counts from a new beginning, in a new world.
             self.lost, self._drift_rad = True, heading_sigma_rad
         self._sample_ns, self._sample_drift_rad = t_ns, heading_sigma_rad
@@ -124,7 +120,7 @@ class Forearm:
         axes[2] = matrix_of(tilted)[:, 2]  # about the estimated vertical it turns
         wide = z_cov[HEADING, HEADING] + process_noise + np.trace(z_cov[_WRIST, _WRIST])
         return OrientationMeasurement(
-            rotation, _EYE / sigma**2, bool(wide < SURE_RAD**2), axes, process_noise
+            rotation, _EYE / sigma**2, bool(wide < DEFAULT.sure_rad**2), axes, process_noise
         )
 
     def heading_of(self, t_ns: int, R_rig_palm: Float, z: Float) -> float | None:
@@ -144,9 +140,8 @@ class Forearm:
             return False
         self.counts["forearm.outlier"] += 1
         self._contrary_ns.append(t_ns)
-        contrary_ns, contrary = 500_000_000, 5  # what contradicts for so long, and so often, is right
-        long = abs(t_ns - self._contrary_ns[0]) > contrary_ns
-        return long and len(self._contrary_ns) >= contrary
+        long = abs(t_ns - self._contrary_ns[0]) > round(1e9 * DEFAULT.contrary_s)
+        return long and len(self._contrary_ns) >= DEFAULT.contrary_palms
 
     def world_at(self, t_ns: int, wrist_angles_rad: Float, wrist_cov: Float) -> tuple[Float, Float]:
         """Return the palm orientation at a time in the IMU's own world; needs no heading.
@@ -196,10 +191,11 @@ class Forearm:
         since_s = 0.0 if self._asked_ns is None else 1e-9 * abs(t_ns - self._asked_ns)
         even_rad = abs(found.drift_rad - self._drift_rad)
         process_noise = found.drift_rad**2 - self._drift_rad**2
+        least, most = DEFAULT.heading_least_rad_s**2 * since_s, DEFAULT.heading_most_rad_s**2 * since_s
         if found.drift_rad >= ANYWHERE_RAD:  # as much as is ever reported
-            even_rad, process_noise = max(even_rad, self._imu.heading_drift_rad_s * since_s), _MOST2 * since_s
+            even_rad, process_noise = max(even_rad, self._imu.heading_drift_rad_s * since_s), most
         self._asked_ns, self._drift_rad = t_ns, found.drift_rad
-        return float(max(even_rad**2, min(max(process_noise, _PROCESS_NOISE2 * since_s), _MOST2 * since_s)))
+        return float(max(even_rad**2, min(max(process_noise, least), most)))
 
 
 def _wxyz(rotation: Float) -> Wxyz:
@@ -208,7 +204,7 @@ def _wxyz(rotation: Float) -> Wxyz:
     return w, x, y, z
 
 
-_ORIENTATION_INFO = np.eye(3) * 1e6  # of a palm that stands: a thousandth of a radian
+_ORIENTATION_INFO = np.eye(3) * DEFAULT.stands_rad**-2.0
 _PALM = np.setdiff1d(np.arange(26), CHAINS)
 _NO_AXES = np.zeros((3, 3))
 _NO_POINTS, _NO_COV, _NO_FLAGS = np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, np.bool_)
@@ -242,8 +238,7 @@ class WristPipeline:
         )
         self._place = np.ascontiguousarray(T[:3, 3])
         self._forearm = None if setup.imu is None else Forearm(setup.imu, self.counts)
-        never_ns = -(2**62)
-        self._last_ns, self._seen_ns = never_ns, np.full(5, never_ns)
+        self._last_ns, self._seen_ns = NEVER_NS, np.full(5, NEVER_NS)
         self._forget_ns = round(1e9 * settings.forget_s)
 
     def push(self, message: WristDetections) -> list[SolvedPose]:
@@ -314,7 +309,7 @@ class WristPipeline:
         )
 
 
-_MAX_AGE_NS = 70_000_000  # an older strobe cycle constrains no finger now
+_MAX_AGE_NS, _APART_NS = round(1e9 * DEFAULT.cycle_age_s), round(1e9 * DEFAULT.cycle_apart_s)
 
 
 class WristSide:
@@ -333,10 +328,9 @@ class WristSide:
         forearm = None if setup.imu is None else Forearm(setup.imu, counts)
         self.forearm = forearm if forearm is not None and forearm.placed else None
         self._reader = CycleReader(setup, counts)
-        kept = 8
-        self._waiting: deque[WristDetections] = deque(maxlen=kept)
-        self._last_ns = -(2**62)
-        self.laser_m, self.laser_ns = np.full((5, 3), nan), -(2**62)
+        self._waiting: deque[WristDetections] = deque(maxlen=round(DEFAULT.cycles))
+        self._last_ns = NEVER_NS
+        self.laser_m, self.laser_ns = np.full((5, 3), nan), NEVER_NS
         self.solver_mode, self.ambiguous = np.zeros(5, np.uint8), np.zeros(5, np.bool_)
 
     def push(self, message: WristDetections) -> int | None:
@@ -354,8 +348,7 @@ class WristSide:
         late_ns, message = self._setup.late_ns, None
         if not self._continuous:
             near = min(self._waiting, key=lambda one: abs(one.t_ns + late_ns - t_ns), default=None)
-            own_ns = 17_000_000  # half the period of the strobe cycles: of epochs that are unrelated
-            message = near if near is not None and abs(near.t_ns + late_ns - t_ns) <= own_ns else None
+            message = near if near is not None and abs(near.t_ns + late_ns - t_ns) <= _APART_NS else None
         else:
             while self._waiting and self._waiting[0].t_ns + late_ns <= t_ns:
                 message = self._waiting.popleft()
@@ -375,7 +368,7 @@ class WristSide:
             self.forearm.lost = False
             estimator.forget_heading()
         orientation = self.forearm.orientation_at(t_ns, estimator.extras, estimator.extras_cov)
-        unknown = estimator.extras_cov[HEADING, HEADING] > LOST_RAD**2
+        unknown = estimator.extras_cov[HEADING, HEADING] > DEFAULT.heading_lost_rad**2
         return None if unknown else orientation
 
     def solved(self, t_ns: int, hand: Fitted, estimator: Estimator, *, oriented: bool) -> None:

@@ -9,7 +9,7 @@ of expected squares, so that a finger that is hardly known feigns no closeness. 
 fingers of usual hands had been seen, and fade back to that.
 """
 
-from math import exp, inf, radians, sqrt
+from math import exp, inf, sqrt
 from typing import Any
 
 from common.arrays import Float
@@ -32,9 +32,8 @@ from master.estimator.sensors import (
 )
 from master.estimator.settings import Settings
 from master.estimator.solve import Posterior, palm_off, past_gradient
-from master.estimator.state import NEVER_NS, HandState, predict_extras
-
-_BENT_RAD2 = radians(45.0) ** 2  # of a finger that counts as one
+from master.estimator.state import HandState, predict_extras
+from master.fabrik.settings import NEVER_NS
 
 
 @inner
@@ -43,7 +42,7 @@ def expect_coupling(settings: Settings, state: HandState, dt_s: float, prior: Pr
     kept, sums = exp(-dt_s / settings.coupled_s), state.coupling
     for i in range(3):
         sums[i] *= kept
-    stationary = settings.coupled_fingers * _BENT_RAD2
+    stationary = settings.coupled_fingers * settings.bent_rad**2
     squared = stationary + sums[0]
     share = sums[1] / squared
     spread2 = (stationary * settings.coupled_spread**2 + sums[2]) / squared - share * share
@@ -174,7 +173,7 @@ def _choose(
         task.scanned[4 * f + k] = scan.mode[f, k]
     task.solver_mode[f] = _IK if shown else _FK
     curled = f > 0 and scan.out[f, 2] > settings.branch_rad
-    task.ambiguous[f] = scan.parts[f] > 1.5 or (curled and not shown)
+    task.ambiguous[f] = scan.parts[f] > 1.0 or (curled and not shown)
     # The unit of light is learnt a little at a time, and nothing of a finger that is ambiguous.
     excluded = task.ambiguous[f] or scan.chi2[f] > settings.teaching_gate
     lines.teaches[f] = 1.0 if shown and not excluded else 0.0

@@ -15,7 +15,7 @@ through the lens as a polygon (`centre_of_blob`); in every frame it is expanded 
 
 from functools import lru_cache
 from math import acos, cos, pi, sin, sqrt
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,30 +26,7 @@ from common.kernels import inner, kernel
 from master.estimator.epoch import SolvedHand
 from master.estimator.sensors import CameraArrays, project
 from master.fabrik.intersection import Rays
-
-_ANGLES = 90  # steps of the tables
-
-
-class CapSettings(NamedTuple):
-    """Numbers of the caps' observation model.
-
-    `alike_share`: what edges of two blobs of 200 px do not explain. `reach`: what hides a part from one
-    camera is near the line of sight of the others, and none of them can measure what is hidden from all: of
-    20 rendered caps the lesser hidden part by the larger is 0.16 in the mean, 0.28 rms.
-    """
-
-    flat_share: float = 0.6  # a flat marker that shows less of the best camera's is tilted (53 deg) or hidden
-    least_share: float = 0.8  # least part of a cap that counts as whole: its radius is a tenth smaller
-    alike_share: float = 0.9  # least part of the share that another camera sees
-    reach: float = 0.2  # least hidden part by the largest of all cameras
-    rotation_rad_s: float = 2.0  # standard deviation: a fist closes in a second
-    radius_share: float = 0.1  # relative error of a profile's radii: 0.8 mm
-    relief_m: float = 0.4e-3  # of a flat marker: 16 mm of colour on a curvature of 50 mm bulge by 0.6 mm
-    most_tilt: float = 2.0  # largest tangent of the tilt of a sigma point, which stays on its side
-    bent_rad: float = 2.356194490192345  # from the camera, of an unknown hand: it still shows a strip
-
-
-CAPS = CapSettings()
+from master.fabrik.settings import CAPS
 
 
 class CapTables(NamedTuple):
@@ -74,7 +51,7 @@ class CapTables(NamedTuple):
     def flat(cls, count: int) -> "CapTables":
         """Tables of markers that are all flat."""
         nothing = np.zeros(0, np.int64)
-        appearances = np.zeros((0, _ANGLES + 1, 3))
+        appearances = np.zeros((0, CAPS.angles + 1, 3))
         return cls(np.full(count, -1, np.int64), appearances, np.zeros(0), nothing, nothing)
 
     def pointing(self, hand: SolvedHand, age_s: float) -> tuple[Float, Float]:
@@ -91,7 +68,7 @@ class CapTables(NamedTuple):
         return ahead, tilt
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=CAPS.tables)
 def _tables(model: HandModel, markers: tuple[str, ...]) -> CapTables:
     out = CapTables.flat(len(markers))
     joints, fingers, appearances = list[int](), list[int](), list[Float]()
@@ -120,10 +97,10 @@ def _tables(model: HandModel, markers: tuple[str, ...]) -> CapTables:
 def _appearances(points: Float, normals: Float, areas: Float) -> Float:
     """Tabulate a cap whose finger points 0..180 degrees away from the eye.
 
-    (_ANGLES + 1, 3): the seen centroid along the finger and, square to it, towards the eye [m], from the
+    (CAPS.angles + 1, 3): the seen centroid along the finger and, square to it, towards the eye [m], from the
     cap's own; and the area seen [m^2]. A cap is round, so that the one angle is enough.
     """
-    angle = np.arange(_ANGLES + 1) * (np.pi / _ANGLES)
+    angle = np.arange(CAPS.angles + 1) * (np.pi / CAPS.angles)
     eye = np.stack([np.sin(angle), np.zeros_like(angle), -np.cos(angle)], axis=1)
     visible_m2 = np.maximum(eye @ normals.T, 0.0) * areas
     shown = visible_m2.sum(axis=1)
@@ -141,7 +118,7 @@ def cap_surface(radius_m: float, ahead_m: float) -> tuple[Float, Float, Float]:
         Points (N, 3) [m], outward normals (N, 3), areas (N,) [m^2].
     """
     length = max(radius_m - 2.0 * min(ahead_m, 0.5 * radius_m), 0.0)
-    rings, spokes = 16, 48  # samples of the surface
+    rings, spokes = CAPS.rings, CAPS.spokes
     phi = (np.arange(spokes) + 0.5) * 2 * np.pi / spokes
     circle = np.stack([np.cos(phi), np.sin(phi), np.zeros(spokes)], axis=1)
     # Rings of equal height have equal area, on a sphere as on a cylinder (Archimedes).
@@ -158,10 +135,6 @@ def cap_surface(radius_m: float, ahead_m: float) -> tuple[Float, Float, Float]:
         normals.append(circle)
         areas.append(np.full(spokes, 2 * np.pi * radius_m * length / (rings * spokes)))
     return np.concatenate(points), np.concatenate(normals), np.concatenate(areas)
-
-
-TILTED = 7  # directions of a cap of a known hand
-ANY = 5  # and while no hand is known
 
 
 class Views(NamedTuple):
@@ -184,7 +157,7 @@ class Views(NamedTuple):
     def empty(cls, cameras: int) -> "Views":
         """Room for a number of cameras."""
         by_camera = cameras, cameras, cameras
-        by_direction = (TILTED, 3), (TILTED, cameras, 2), (TILTED, cameras), (TILTED, 3)
+        by_direction = (CAPS.tilted, 3), (CAPS.tilted, cameras, 2), (CAPS.tilted, cameras), (CAPS.tilted, 3)
         return cls(*(np.empty(shape) for shape in (*by_camera, *by_direction, 3, 3, (3, 2), (3, 3), (3, 3))))
 
 
@@ -218,7 +191,7 @@ def tilted(row: int, R: Float, tilt_rad2: Float, rotation_rad2: float, out: Floa
     The six are sigma points of two uncertain numbers: the mean square of what differs between them and the
     first is its variance (Julier and Uhlmann 1997; four would do where all is linear, but a cap seen from
     behind looks different from every side). `R` (K, 3, 3): -z is the finger's direction, rig frame;
-    `tilt_rad2` (K, 3, 3) its covariance; `rotation_rad2`: variance that its age adds; `out` (TILTED, 3).
+    `tilt_rad2` (K, 3, 3) its covariance; `rotation_rad2`: variance that its age adds; `out` (CAPS.tilted, 3).
     """
     xx, xy, yy = rotation_rad2, 0.0, rotation_rad2
     for a in range(3):
@@ -234,7 +207,7 @@ def tilted(row: int, R: Float, tilt_rad2: Float, rotation_rad2: float, out: Floa
     most = CAPS.most_tilt
     for i in range(3):
         out[0, i] = -R[row, i, 2]
-    for t in range(1, TILTED):
+    for t in range(1, CAPS.tilted):
         angle = (t - 1) * np.pi / 3.0
         c, s = sqrt(2.0) * cos(angle), sqrt(2.0) * sin(angle)
         x = min(max(first * c, -most), most)
@@ -246,7 +219,7 @@ def tilted(row: int, R: Float, tilt_rad2: Float, rotation_rad2: float, out: Floa
 
 @inner
 def any_direction(cameras: CameraArrays, point: Float, out: Float) -> None:
-    """Write directions (ANY, 3) in which a cap at a point may point, hand unknown.
+    """Write directions (CAPS.any_tilted, 3) in which a cap at a point may point, hand unknown.
 
     Towards the middle of the cameras, and four bent away from it as far as the cap is still seen.
     """
@@ -331,7 +304,7 @@ def hidden_part(
         most = max(most, out[c])
     for c in range(cameras):
         if np.isfinite(area_px2[c] * scale_m[c]):
-            out[c] = (max(out[c], CAPS.reach * most) * caps.radius_m[row] / scale_m[c]) ** 2
+            out[c] = (max(out[c], CAPS.least_hidden * most) * caps.radius_m[row] / scale_m[c]) ** 2
 
 
 @inner
@@ -375,21 +348,16 @@ def appearance(
                 views.bias[t, c, 1] += rest_v
 
 
-_CORNERS: Final = 64  # of the polygon; that for a circle is 0.2 % small, which is scaled away
-_ROUNDS: Final = 3  # each leaves a few per cent of the shift: the outline starts around the centroid
-_CELL_PX: Final = 8
-
-
 def round_outline() -> Float:
     """A circle of unit area around the origin, (K, 2)."""
-    angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS, endpoint=False)
+    angle = np.linspace(0.0, 2.0 * np.pi, CAPS.corners, endpoint=False)
     return np.stack([np.cos(angle), np.sin(angle)], axis=1) / np.sqrt(np.pi)
 
 
 def card_outline(width: float, height: float) -> Float:
     """Return an upright rectangle (K, 2) of unit area, `width` : `height`, around 0."""
     corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
-    along = np.linspace(0.0, 1.0, _CORNERS // 4, endpoint=False)[:, None]  # the lens bends the sides
+    along = np.linspace(0.0, 1.0, CAPS.corners // 4, endpoint=False)[:, None]  # the lens bends the sides
     sides = [a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
     return np.concatenate(sides) * np.array([width, height]) / np.sqrt(width * height)
 
@@ -409,7 +377,7 @@ def centre_of_blob(camera: CameraModel, uv: Float, area_px2: Float, outline: Flo
     seen = out[known]
     size = np.sqrt(area_px2[known] / (camera.matrix[0, 0] * camera.matrix[1, 1]))
     centre = seen
-    for _ in range(_ROUNDS):
+    for _ in range(CAPS.rounds):
         xy = camera.undistort(centre)
         area, _ = _polygon(camera.distort(xy[:, None] + size[:, None, None] * outline))
         size = size * np.sqrt(area_px2[known] / area)
@@ -435,18 +403,18 @@ class LensShift:
 
     def __init__(self, cameras: tuple[CameraModel, ...]) -> None:
         self.any = any(camera.distortion.any() for camera in cameras)
-        cells = np.array([[camera.width_px, camera.height_px] for camera in cameras]) // _CELL_PX + 1
+        cells = np.array([[camera.width_px, camera.height_px] for camera in cameras]) // CAPS.cell_px + 1
         columns, rows = (int(n) for n in cells.max(axis=0))
         middles = np.empty((rows, columns, 2))
-        middles[..., 0] = _CELL_PX * np.arange(columns)
-        middles[..., 1] = _CELL_PX * np.arange(rows)[:, None]
+        middles[..., 0] = CAPS.cell_px * np.arange(columns)
+        middles[..., 1] = CAPS.cell_px * np.arange(rows)[:, None]
         self._per_px2 = np.stack([_shift_per_px2(camera, middles) for camera in cameras])
         self._last = (cells - 1.0)[:, None]  # (C, 1, 2)
         self._camera = np.arange(len(cameras))[:, None]
 
     def centres(self, uv: Float, area_px2: Float) -> Float:
         """Where cameras see blobs' centres (C, M, 2) [px]; area NaN: the centroids."""
-        cell = np.fmin(np.fmax(uv / _CELL_PX + 0.5, 0.0), self._last).astype(np.int64)  # NaN: any
+        cell = np.fmin(np.fmax(uv / CAPS.cell_px + 0.5, 0.0), self._last).astype(np.int64)  # NaN: any
         shift = self._per_px2[self._camera, cell[..., 1], cell[..., 0]]
         return uv - shift * np.fmax(area_px2, 0.0)[..., None]
 

@@ -18,7 +18,7 @@ unknown is not the abduction a but a / (share of the range that is left at this 
 constant.
 """
 
-from math import cos, inf, isfinite, pi, sin, sqrt
+from math import cos, inf, isfinite, sin, sqrt
 
 import numpy as np
 
@@ -54,6 +54,7 @@ from master.fabrik.linear_algebra import (
     rotate,
     rotate_back,
 )
+from master.fabrik.settings import FABRIK
 
 
 @kernel
@@ -71,8 +72,7 @@ def least_squares(
     columns, trial_columns = np.empty((4, 3)), np.empty((4, 3))
     next_angles = np.empty(4)
     left = _evaluate(chain, goal, unknowns, angles, columns)
-    first_damping_m2 = 1e-7
-    cost, damping = dot(left, left), first_damping_m2
+    cost, damping = dot(left, left), FABRIK.first_damping_m2
     for _ in range(max_steps):
         if cost <= tolerance_m * tolerance_m or not _step(chain, unknowns, left, columns, damping, trial):
             break
@@ -81,7 +81,7 @@ def least_squares(
         least_damping_m2, most_damping_m2 = 1e-13, 1.0
         if trial_cost < cost:
             gain = cost - trial_cost
-            left, cost, damping = trial_left, trial_cost, max(damping * 0.1, least_damping_m2)
+            left, cost, damping = trial_left, trial_cost, max(damping * FABRIK.damping_down, least_damping_m2)
             for i in range(4):
                 unknowns[i], angles[i] = trial[i], next_angles[i]
                 put_vector(columns, i, vector_at(trial_columns, i, START))
@@ -91,7 +91,7 @@ def least_squares(
         elif damping > most_damping_m2:
             break
         else:
-            damping *= 10.0
+            damping *= FABRIK.damping_up
     return length(left)
 
 
@@ -168,17 +168,8 @@ def _free(chain: ChainArrays, unknowns: Float, left: Vector, columns: Float, i: 
     return not (low == high or (unknowns[i] <= low and pull <= 0.0) or (unknowns[i] >= high and pull >= 0.0))
 
 
-REACHED_M = 1e-6
-_TOLERANCE_M = 0.05 * REACHED_M
-"""A limit passed by less is rounding: the angle is clamped, which moves the point < 0.2 um."""
 PIP, DIP = constant(1), constant(2)  # links
-_PER_BRANCH = 2.0 * pi
-"""How much rather the more bent branch is taken: more than any abduction, by which the poses of one are ranked."""
-_SPREAD_OF_STARTS = ((0.1, 0.9), (0.9, 0.1), (0.5, 0.0), (0.5, 1.0), (0.0, 0.5), (1.0, 0.5))
-"""PIP and DIP, as shares of their ranges, from which a free pair is sought when the coupled one fails."""
-_STARTS = 4 + 2 * len(_SPREAD_OF_STARTS)
-_FIRST_STEPS, _MOST_STEPS = constant(8), constant(60)
-"""Of least squares: from each start, and from the best of their ends."""
+_STARTS = 4 + 2 * len(FABRIK.starts)
 
 
 @kernel
@@ -217,7 +208,7 @@ def closed_form(
                 # bones out of plane cannot point exactly at the pole: legal angles may still miss
                 miss = length(minus(end_of(chain, trial), goal))
                 rank = _rank(trial, warm_start, branches - 1 - b)
-                if miss < REACHED_M and rank < best:
+                if miss < FABRIK.reached_m and rank < best:
                     best, residual = rank, miss
                     _copy(trial, angles)
             _keep(initial_angles, penalties, trial, cut + 1e2 * sqrt(max(off, 0.0)))
@@ -279,8 +270,7 @@ def _invert(
     if off >= 0.0:
         return far if distance2 >= far2 else bent, off
     pip = far + sqrt((far2 - distance2) / (far2 - near2)) * (bent - far)
-    root_steps = 60
-    for _ in range(root_steps):
+    for _ in range(FABRIK.root_steps):
         value, dip_per_pip = distance2_of(chain, ratio, pip)
         if value > distance2:
             far = pip
@@ -315,7 +305,7 @@ def _known(angles: Float) -> bool:
 def _rank(angles: Float, warm_start: Float, branch: int) -> float:
     """Rank of a pose that hits, least first: change [rad], or branch and abduction."""
     if not _known(warm_start):
-        return branch * _PER_BRANCH + abs(angles[0])
+        return branch * FABRIK.branch + abs(angles[0])
     rank = 0.0
     for i in range(4):
         rank += abs(angles[i] - warm_start[i])
@@ -371,17 +361,17 @@ def nearest_pose(
     local = rotate_back(matrix_at(chain.links, ROOT, ROTATION), goal)
     starts = len(initial_angles) if chain.follower >= 0 else _STARTS
     for start in range(starts + 1):
-        steps = _FIRST_STEPS
+        steps = FABRIK.first_steps
         if start < starts:
             _start(chain, local, warm_start, initial_angles, start, trial)
         else:
-            steps = _MOST_STEPS
+            steps = FABRIK.most_steps
             _copy(angles, trial)
-        left = least_squares(chain, goal, _TOLERANCE_M, steps, trial)
+        left = least_squares(chain, goal, FABRIK.within * FABRIK.reached_m, steps, trial)
         if start == 0 or left < best:
             best = left
             _copy(trial, angles)
-        if best < REACHED_M:
+        if best < FABRIK.reached_m:
             break
     return best
 
@@ -397,7 +387,7 @@ def _start(
     elif pair < 0:
         _copy(warm_start if _known(warm_start) else initial_angles[0], angles)
     else:
-        pip_share, dip_share = _SPREAD_OF_STARTS[pair // 2]
+        pip_share, dip_share = FABRIK.starts[pair // 2]
         pip = chain.spans[2, 0] + pip_share * (chain.spans[2, 1] - chain.spans[2, 0])
         dip = chain.spans[3, 0] + dip_share * (chain.spans[3, 1] - chain.spans[3, 0])
         _swing(chain, pip, dip, local, pair % 2, angles)

@@ -22,12 +22,7 @@ from common.arrays import Float
 from common.calibration import AffineDisparityCalibration, PowerLawCalibration, RigCalibration, Volume
 from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
-
-PARALLEL_RAD = np.radians(3.0)
-"""Most by which two cameras may be turned against each other where depth is a law of raw disparity."""
-LAW_RESIDUAL = 0.02
-"""Most by which a law of depth and the cameras' places may differ where both are used."""
-_DEPTHS_M = (0.35, 1.0)
+from master.fabrik.settings import DEPTH
 
 
 def _positive(values: Float) -> Float:
@@ -143,11 +138,11 @@ def law_contradicts(rig: RigCalibration, cameras: Sequence[CameraModel]) -> str:
     if law is None or rig.solver == "fabrik":
         return ""
     off, depth_m = law_residual(law, cameras, rig.volume)
-    if off <= LAW_RESIDUAL:
+    if off <= DEPTH.law_residual:
         return ""
     return (
         f"depth_model {rig.depth_model!r} is {1e2 * off:.1f} % off the cameras' places at {depth_m:.2f} m, and solver"
-        f" 'estimator' needs both to agree within {1e2 * LAW_RESIDUAL:.0f} %"
+        f" 'estimator' needs both to agree within {1e2 * DEPTH.law_residual:.0f} %"
     )
 
 
@@ -162,21 +157,20 @@ def _crooked(left: CameraModel, right: CameraModel) -> str:
     x, y, z = R @ (right.centre - left.centre)
     angle = float(np.arccos(np.clip((np.trace(rotation) - 1.0) / 2.0, -1.0, 1.0)))
     focal = left.matrix[1, 1] / right.matrix[1, 1]
-    if angle > PARALLEL_RAD:
+    if angle > DEPTH.parallel_rad:
         return (
             f"the second is turned by {np.degrees(angle):.1f} degrees against the first,"
-            f" at most {np.degrees(PARALLEL_RAD):.0f} are allowed"
+            f" at most {np.degrees(DEPTH.parallel_rad):.0f} are allowed"
         )
     if x <= 0.0:
         return "the second is not to the right of the first: name the left one first in 'cameras'"
-    alike = 0.05
-    if max(abs(y), abs(z)) > alike * x:
+    if max(abs(y), abs(z)) > DEPTH.alike * x:
         off_mm = 1e3 * max(abs(y), abs(z))
         return (
             f"their baseline of {1e3 * x:.0f} mm is off the image rows by {off_mm:.0f} mm,"
-            f" at most {1e2 * alike:.0f} % are allowed"
+            f" at most {1e2 * DEPTH.alike:.0f} % are allowed"
         )
-    if abs(focal - 1.0) > alike or left.height_px != right.height_px:
+    if abs(focal - 1.0) > DEPTH.alike or left.height_px != right.height_px:
         return f"their focal lengths differ by {1e2 * abs(focal - 1.0):.0f} %, or their heights do"
     return ""
 
@@ -197,12 +191,12 @@ def law_residual(law: DepthLaw, cameras: Sequence[CameraModel], volume: Volume |
     Against the geometry of the first two cameras; `volume`: whose depths are asked; None: usual ones.
     """
     left = cameras[0]
-    low_m, high_m = _DEPTHS_M
+    low_m, high_m = DEPTH.usual_m
     if volume is not None:
         corners = np.array(list(product(*zip(volume.low_m, volume.high_m, strict=True))))
         ahead = (corners - left.centre) @ left.T_rig_camera[:3, 2]
-        low_m, high_m = max(float(ahead.min()), 0.1 * float(ahead.max())), float(ahead.max())
-    depth = np.linspace(low_m, high_m, 9)
+        low_m, high_m = max(float(ahead.min()), DEPTH.nearest * float(ahead.max())), float(ahead.max())
+    depth = np.linspace(low_m, high_m, DEPTH.compared)
     off = np.abs(law.depth(disparity_on_axis(cameras, depth)) / depth - 1.0)
     worst = int(np.nan_to_num(off, nan=np.inf).argmax())
     return float(np.nan_to_num(off[worst], nan=np.inf)), float(depth[worst])
@@ -261,7 +255,7 @@ class CalibrationResidual:
         # of a mean of absolute errors that are normally distributed
         return cls(
             rays_px=0.0 if rays is None else rays.residual.get("rms_px", 0.0),
-            law=1e-2 * mean_percent * sqrt(pi / 2),
+            law=mean_percent / 1e2 * sqrt(pi / 2),
         )
 
 

@@ -74,6 +74,7 @@ from master.fabrik.linear_algebra import (
     rotation_about,
     transposed,
 )
+from master.fabrik.settings import FABRIK
 
 _SEARCH_STARTS = (1.0, 0.5, 0.0)
 
@@ -153,9 +154,8 @@ def _nearest_from(chain: Chain, share: float) -> float:
     low, high = chain.arrays.spans.T
     first = _count(chain.links[0].joint)
     angles = np.append(np.clip(0.0, low[:first], high[:first]), (low + share * (high - low))[first:])
-    first_step, least_step = 0.25, 1e-4
-    here, step = distance(angles), first_step
-    while step > least_step:
+    here, step = distance(angles), FABRIK.search_step
+    while step > FABRIK.search_least:
         before = here
         for i in range(first, len(angles)):
             start = angles[i]
@@ -338,7 +338,11 @@ class Fabrik:
 
     @classmethod
     def of(
-        cls, chain: Chain, tolerance_m: float = 1e-5, max_iterations: int = 100, restarts: int = 3
+        cls,
+        chain: Chain,
+        tolerance_m: float = FABRIK.tolerance_m,
+        max_iterations: int = FABRIK.iterations,
+        restarts: int = FABRIK.restarts,
     ) -> "Fabrik":
         """Prepare a chain.
 
@@ -436,8 +440,7 @@ def solve_chain(
 def _bend_to(chain: ChainArrays, distance: float, front: float, back: float, angles: Float) -> None:
     """Write the bent pose whose end is as far from the root as the target."""
     low, high = 0.0, 1.0
-    restart_halvings = 14
-    for _ in range(restart_halvings):
+    for _ in range(FABRIK.halvings):
         share = 0.5 * (low + high)
         _bend(chain, share, front, back, angles)
         if length(end_of(chain, angles)) > distance:
@@ -482,14 +485,12 @@ def _attempt(
         backward_pass(chain, positions, orientations, now, goal, places)
         forward_pass(chain, places, now, positions, orientations)
         residual = length(minus(vector_at(positions, count, START), goal))
-        stall = 0.995
-        slow = slow + 1 if residual > stall * last else 0
+        slow = slow + 1 if residual > FABRIK.stall * last else 0
         last = residual
         if residual < best:
             best = residual
             for i in range(len(angles)):
                 angles[i] = now[i]
-        stall_iterations = 6
-        if best <= tolerance_m or slow >= stall_iterations:
+        if best <= tolerance_m or slow >= FABRIK.stalls:
             return best, iteration
     return best, max_iterations

@@ -32,25 +32,7 @@ from common.arrays import Bool, Float, Int
 from common.kernels import constant, inner, kernel
 from master.estimator.sensors import CameraArrays, project, undistort
 from master.fabrik.linear_algebra import inverse_3_plus
-
-
-class RaySettings(NamedTuple):
-    """Numbers of triangulation by rays.
-
-    `rig_px`: what lens, mount and calibration leave at one marker, for the gate alone: two sure cameras may
-    miss each other by 6 px. Cheap lenses fit to about half a pixel, and a mount gives way when touched.
-    `ambiguous`: 1 in 100 by chance, one degree of freedom. `common`: rendered and detected: 0.7 of all
-    together, 0.8 by medians, of single fingers 0.3 (little) to 0.8 (index).
-    """
-
-    rig_px: float = 0.85  # standard deviation per axis
-    false_alarm: float = 1e-6  # probability that noise alone exceeds the gate: 4.9 sigma for two cameras
-    ambiguous: float = float(chdtri(1, 0.01))  # least difference in chi-square of two outliers
-    common: float = 0.75  # part of the variance of whole caps' centroids that is the same in all cameras
-    common_px: float = 0.1  # above it a slave reports occlusion, or time adds its own: not common
-
-
-RAYS = RaySettings()
+from master.fabrik.settings import ASSOCIATION, RAYS
 
 
 class Triangulation(NamedTuple):
@@ -170,8 +152,7 @@ def refine(cameras: CameraArrays, rays: Rays) -> bool:
     Returns whether the point is in front of the cameras and its depth is determined.
     """
     seen, J, cov, rhs = rays.seen, rays.J, rays.cov, rays.rhs
-    steps = 8  # of Gauss-Newton; from the linear solution three are the rule
-    for _ in range(steps):
+    for _ in range(RAYS.steps):
         _clear(rays)
         for c in range(rays.weight.shape[0]):
             w = rays.weight[c]
@@ -277,7 +258,7 @@ def limits_of(cameras: int) -> Float:
 
 
 def triangulate(
-    cameras: CameraArrays, uv: Float, sigma_px: float | Float = 0.1, rays_px: float = 0.0
+    cameras: CameraArrays, uv: Float, sigma_px: float | Float = RAYS.sigma_px, rays_px: float = 0.0
 ) -> Triangulation:
     """Triangulate markers as they are seen, by the rays of all cameras.
 
@@ -300,28 +281,6 @@ def triangulate(
     none, scratch = np.zeros((count, markers), np.bool_), Rays.empty(count)
     intersect(cameras, rays_px, limits_of(count), observed, none, scratch, points, cov, errors, outliers)
     return Triangulation(points, cov, errors[0], errors[1], outliers)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GateSettings:
-    """Numbers of the association.
-
-    `overrule`: 1 in 100 by chance, one degree of freedom. `past_most`: more than one camera, less than two.
-    """
-
-    overrule: float = float(chdtri(1, 0.01))  # least gain in chi-square for each camera that is overruled
-    past_most: float = 1.5 * float(chdtri(1, 0.01))  # largest cost of the distance from the past
-    false_alarm: float = 1e-6  # probability that noise alone is farther from a prediction than the gate
-    most_cameras: int = 5  # with an alternative that are combined: 32 combinations; more are rejected
-    same_m: float = 0.02  # combinations whose points are nearer are one thing: a finger's width
-    place_m: float = 0.01  # standard deviation of a marker's place a moment ago
-    speed_m_s: float = 1.0  # standard deviation of a marker's speed
-    forget_s: float = 0.5  # age from which a past place is not used
-    model_m: float = 0.015  # standard deviation of a marker's place by its hand's others
-    spread_m: float = 0.1  # standard deviation of a marker's distance from the middle of an unsolved hand
-
-
-SETTINGS = GateSettings()
 
 
 class Prior(NamedTuple):
@@ -348,7 +307,7 @@ def among(others_m: Float, on_hand: Int) -> Prior:
     triangulated = triangulated[np.isfinite(triangulated[:, 0])]
     if len(triangulated):
         points[on_hand] = np.median(triangulated, axis=0)
-    return Prior(points, np.tile(SETTINGS.spread_m**2 * np.eye(3), (len(points), 1, 1)))
+    return Prior(points, np.tile(ASSOCIATION.spread_m**2 * np.eye(3), (len(points), 1, 1)))
 
 
 def associate(
@@ -374,8 +333,8 @@ def associate(
     out = Association(first_uv.copy(), first_sigma.copy(), area.copy(), taken, taken.copy())
     for m in np.flatnonzero(alternative.any(axis=0)):
         where = np.flatnonzero(alternative[:, m])
-        out.uv[where[SETTINGS.most_cameras :], m] = np.nan
-        where = where[: SETTINGS.most_cameras]
+        out.uv[where[ASSOCIATION.most_cameras :], m] = np.nan
+        where = where[: ASSOCIATION.most_cameras]
         # (K, r) whether the second place is taken in each such camera; the first combination: nowhere.
         second = np.array(list(product((False, True), repeat=len(where))))
         uv = np.repeat(out.uv[:, m : m + 1], len(second), axis=1)
@@ -383,9 +342,9 @@ def associate(
         for c, use in zip(where, second.T, strict=True):
             uv[c, use], sigma_px[c, use] = alternatives[0][c, m], alternatives[1][c, m]
         age_s = past[1][m]
-        moved = (SETTINGS.place_m + SETTINGS.speed_m_s * age_s) ** 2 * np.eye(3)
-        was = past[0][m] if age_s <= SETTINGS.forget_s else np.full(3, np.nan)
-        model = SETTINGS.model_m**2 * np.eye(3)
+        moved = (ASSOCIATION.place_m + ASSOCIATION.speed_m_s * age_s) ** 2 * np.eye(3)
+        was = past[0][m] if age_s <= ASSOCIATION.forget_s else np.full(3, np.nan)
+        model = ASSOCIATION.model_m**2 * np.eye(3)
         priors = Prior(hand.points_m[m], hand.cov_m2[m] + model), Prior(was, moved)
         k = _best(cameras, uv, sigma_px, second.sum(axis=1), priors, rays_px)
         out.dropped[m], out.taken[m] = k is None, k is not None and k > 0
@@ -418,16 +377,18 @@ def _best(
     else:
         found = triangulate(cameras, uv, sigma_px, rays_px)
         places, cov, cost = found.points_m, found.cov_m2, found.chi_square
-        fits, same = np.isfinite(places[:, 0]) & ~found.outliers, SETTINGS.same_m
+        fits, same = np.isfinite(places[:, 0]) & ~found.outliers, ASSOCIATION.same_m
     from_hand, from_past = (_distances(places, cov, *prior) for prior in priors)
-    farthest = float(chdtri(places.shape[1], SETTINGS.false_alarm))
+    farthest = float(chdtri(places.shape[1], ASSOCIATION.false_alarm))
     fits = fits & (from_hand <= farthest) & ((from_past <= farthest) | (overruled == 0))
     if not fits.any():
         return None
-    cost = cost + from_hand + np.minimum(from_past, SETTINGS.past_most) + SETTINGS.overrule * overruled
+    cost = cost + from_hand + np.minimum(from_past, ASSOCIATION.past_most) + ASSOCIATION.overrule * overruled
     cost = np.where(fits, cost, np.inf)
     best = int(np.argmin(cost))
-    near = (cost <= cost[best] + SETTINGS.overrule) & (np.linalg.norm(places - places[best], axis=1) > same)
+    near = (cost <= cost[best] + ASSOCIATION.overrule) & (
+        np.linalg.norm(places - places[best], axis=1) > same
+    )
     return None if best > 0 and near[overruled > 0].any() else best
 
 
@@ -436,7 +397,7 @@ def rehearse(cameras: CameraArrays) -> None:
     nothing = Prior(np.full((1, 3), np.nan), np.full((1, 3, 3), np.nan))
     _in_image(cameras, 0, Prior(nothing.points_m[0], nothing.cov_m2[0]))
     one = np.ones((len(cameras.scale), 1))
-    pixels, alternatives = np.full((*one.shape, 2), 100.0), np.full((*one.shape, 2), 101.0)
+    pixels, alternatives = np.full((*one.shape, 2), 1e2), np.full((*one.shape, 2), 1e3)
     associate(cameras, (pixels, one, one), (alternatives, one), nothing, (nothing.points_m, one[0]))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.kernels import inlined, inner, kernel
+from master.fabrik.settings import FABRIK
 
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
@@ -227,7 +228,7 @@ def eigen(A: Float, n: int, values: Float, vectors: Float) -> None:
     for i in range(n):
         for j in range(n):
             vectors[i, j] = 1.0 if i == j else 0.0
-    for _ in range(30):
+    for _ in range(FABRIK.sweeps):
         off, diagonal = 0.0, 0.0
         for i in range(n):
             diagonal += A[i, i] * A[i, i]
@@ -282,8 +283,8 @@ def diagonalise(A: Float, V: Float) -> None:
     for i in range(n):
         for j in range(n):
             V[i, j] = 1.0 if i == j else 0.0
-    sweeps, nothing = 30, 1e-36  # of Jacobi; squares of what is beside the diagonal, by those on it
-    for _ in range(sweeps):
+    nothing = 1e-36  # squares of what is beside the diagonal, by those on it
+    for _ in range(FABRIK.sweeps):
         off, on = 0.0, 0.0
         for i in range(n):
             on += A[i, i] * A[i, i]

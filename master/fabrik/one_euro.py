@@ -36,20 +36,16 @@ import numpy as np
 from common.arrays import Float, Int
 from common.calibration import FilterCalibration
 from common.kernels import bound, kernel
-
-# Part of the variance of a marker's noise that is new in each frame: about 0.1 on rendered hands, here with room. The
-# rest is light and shape, which stay.
-CARRY_NOTHING = 0.25
-UNSEEN_NS = -(2**63)
+from master.fabrik.settings import FILTER, NEVER_NS
 
 
 @dataclass(frozen=True, slots=True)
 class OneEuroParameters:
     """Settings of the filter, the same for all its signals."""
 
-    min_cutoff_hz: float = 1.0  # at rest; lower: less jitter
-    beta: float = 0.1  # cut-off per speed [Hz per (unit of the signal)/s]; higher: less lag
-    d_cutoff_hz: float = 1.0  # of the speed estimate
+    min_cutoff_hz: float  # at rest; lower: less jitter
+    beta: float  # cut-off per speed [Hz per (unit of the signal)/s]; higher: less lag
+    d_cutoff_hz: float  # of the speed estimate
     restart_gap_s: float = 0.5  # a signal unseen for longer restarts from its next value
     jitter: float = inf  # noise that may be left at rest where it is known, standard deviation [unit]
 
@@ -131,7 +127,7 @@ class OneEuro:
         self._group = np.repeat(np.arange(len(sizes)), sizes)
         self._fastest = np.zeros((len(sizes), 2))
         self._x, self._speed, self._unknown = np.zeros(n), np.zeros(n), np.full(n, nan)
-        self._seen_ns = np.full(n, UNSEEN_NS)
+        self._seen_ns = np.full(n, NEVER_NS)
 
 
 class PointFilter:
@@ -152,7 +148,7 @@ class PointFilter:
     def push(self, t_ns: int, points: Float, cov: Float) -> Float:
         """Filter points (M, 3) [m] of noise cov (M, 3, 3), rig frame, as `OneEuro.push`."""
         variance = np.vecdot(self._R @ cov, self._R)  # of each coordinate: the diagonal of R cov R'
-        return self._filter.push(t_ns, points @ self._R.T, CARRY_NOTHING * variance) @ self._R
+        return self._filter.push(t_ns, points @ self._R.T, FILTER.new_share * variance) @ self._R
 
 
 @kernel
@@ -179,7 +175,7 @@ def filter_step(
         out[i] = nan
         if not isfinite(values[i]):
             continue
-        dt = 1e-9 * (t_ns - seen_ns[i]) if seen_ns[i] != UNSEEN_NS else inf
+        dt = 1e-9 * (t_ns - seen_ns[i]) if seen_ns[i] != NEVER_NS else inf
         if dt > restart_gap:
             x[i], speed[i], seen_ns[i] = values[i], 0.0, t_ns
             out[i] = values[i]
@@ -188,10 +184,9 @@ def filter_step(
         speed[i] += r / (r + 1.0) * ((values[i] - x[i]) / dt - speed[i])
         fastest[group[i], 0] = max(fastest[group[i], 0], abs(speed[i]))
         if variance[i] > jitter_2:
-            quantile = 9.0  # chi-square, one degree of freedom, 99.7 %: what is beyond is motion
-            moved_2 = speed[i] * speed[i] * dt * dt - quantile * r / (2.0 + r) * variance[i]
+            moved_2 = speed[i] * speed[i] * dt * dt - FILTER.quantile * r / (2.0 + r) * variance[i]
             off = values[i] - x[i]
-            u2 = max(moved_2, off * off - quantile * variance[i]) / variance[i]
+            u2 = max(moved_2, off * off - FILTER.quantile * variance[i]) / variance[i]
             fastest[group[i], 1] = max(fastest[group[i], 1], u2)
     for i in range(len(values)):
         if seen_ns[i] == t_ns or not isfinite(values[i]):
@@ -246,14 +241,11 @@ def measure(
     for i in range(values.shape[0]):
         step, variance = values[i] - past[0, i], past[2, i]
         smaller = largest[i] < variance or isnan(variance)
-        # A solved pose is a prior of the next, so its noise stays in part: of seven tenths, a quarter shows.
-        # shown
-        known[i] = (largest[i] if smaller else variance) / 0.25
+        known[i] = (largest[i] if smaller else variance) / FILTER.shown
         if count[0] > 1:
             off = step - ratio * past[1, i]
             shown = off * off / (2.0 * (1.0 + ratio + ratio * ratio))
-            memory_s = 0.4  # a few swings of a trembling hand
-            past[2, i] += passed_s / (memory_s + passed_s) * (shown - variance)
+            past[2, i] += passed_s / (FILTER.memory_s + passed_s) * (shown - variance)
         past[0, i], past[1, i] = values[i], step
     dt_s[0] = passed_s
     count[0], count[1] = count[0] + 1, t_ns

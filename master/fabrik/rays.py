@@ -28,9 +28,6 @@ from common.kernels import bound, inner, kernel
 from master.estimator.epoch import MarkerPositions, SolvedHand
 from master.estimator.sensors import CameraArrays, project
 from master.fabrik.caps import (
-    ANY,
-    CAPS,
-    TILTED,
     CapTables,
     Views,
     any_direction,
@@ -39,7 +36,6 @@ from master.fabrik.caps import (
     tilted,
 )
 from master.fabrik.intersection import (
-    RAYS,
     Rays,
     Triangulation,
     chi_square,
@@ -50,6 +46,7 @@ from master.fabrik.intersection import (
     refine,
     triangulate,
 )
+from master.fabrik.settings import CAPS, RAYS
 
 
 class _Rig(NamedTuple):
@@ -135,7 +132,7 @@ def _correct(rig: _Rig, hand: _Hand, observed: Float, m: int) -> tuple[int, floa
     rays, views, row = rig.rays, rig.views, rig.caps.row[m]
     for c in range(rays.weight.shape[0]):
         views.area[c] = observed[c, m, 3] if rays.weight[c] > 0.0 else np.nan
-    count = TILTED if hand.known else ANY
+    count = CAPS.tilted if hand.known else CAPS.any_tilted
     if row < 0:
         count = 1
     elif hand.known:
@@ -199,8 +196,7 @@ def correct_centres(rig: _Rig, hand: _Hand, observed: Float, out: _Placed) -> No
         for c in range(observed.shape[0]):
             rejected[c, m] = False
         seen, meets, count, shared = _place(rig, hand, observed, rejected, m)
-        fewest = 3  # cameras of which one may be an outlier
-        if seen >= fewest and not meets:
+        if seen >= 3 and not meets:  # one may be an outlier
             outlying = outlier(cameras, rig.limits[seen - 1], rays)
             if outlying >= 0:
                 rejected[outlying, m] = True
@@ -302,6 +298,6 @@ class RayTriangulator:
         self._correct_centres(self._rig, directions, observed, out)
         return RayPositions(*out)
 
-    def triangulate(self, uv: Float, sigma_px: float | Float = 0.1) -> Triangulation:
+    def triangulate(self, uv: Float, sigma_px: float | Float = RAYS.sigma_px) -> Triangulation:
         """Triangulate markers as they are seen (`master.fabrik.intersection`)."""
         return triangulate(self._rig.cameras, uv, sigma_px, self._rig.rays_px)

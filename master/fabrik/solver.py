@@ -24,7 +24,6 @@ from master.estimator.parameters import Mounts
 from master.estimator.posterior import ON_MARKERS
 from master.estimator.state import PALM_PART
 from master.fabrik.closed_form import (
-    REACHED_M,
     back_normal_of,
     closed_form,
     distance2_of,
@@ -37,13 +36,13 @@ from master.fabrik.joints import ChainArrays, Hinge, Rotor, end_of
 from master.fabrik.linear_algebra import IDENTITY, Vector, as_matrix, as_vector, length, minus
 from master.fabrik.one_euro import PointFilter
 from master.fabrik.rays import RayTriangulator
+from master.fabrik.settings import FABRIK, NEVER_NS
 from master.fabrik.sync import FrameSet, FrameSync
 from master.fabrik.triangulate import DepthTriangulator
 
 THUMB = 0
 Four = tuple[float, float, float, float]
 
-_GRID = 2001
 _NO_RESTARTS = constant(0)
 _NAN = float("nan")
 _UNKNOWN = (_NAN,) * 4
@@ -90,8 +89,8 @@ class Finger:
         model: HandModel,
         finger: int,
         offset_m: Float,
-        tolerance_m: float = 1e-5,
-        max_iterations: int = 10,
+        tolerance_m: float = FABRIK.tolerance_m,
+        max_iterations: int = FABRIK.finger_iterations,
     ) -> "Finger":
         """Prepare one finger, 0 thumb ... 4 little.
 
@@ -146,7 +145,7 @@ class Finger:
         before, angles = np.array(_UNKNOWN if warm_start is None else warm_start), np.empty(4)
         left = self.start(self.chain.arrays, self.edges, self.ratio, goal, before, angles)
         a, f, pip, dip = angles.tolist()
-        return FingerSolution(a, f, pip, dip, left, left < REACHED_M)
+        return FingerSolution(a, f, pip, dip, left, left < FABRIK.reached_m)
 
     def forward(self, angles: Four) -> Vector:
         """The point [m] in the palm frame at given angles [rad]."""
@@ -234,8 +233,8 @@ def _branches(chain: Chain, ratio: float) -> Float:
 
     low, high = map(float, chain.spans[2])
     dip_span = [float(bound) for bound in chain.spans[3]]
-    grid: Float = np.linspace(low, high, _GRID)
-    squares = np.empty(_GRID)
+    grid: Float = np.linspace(low, high, FABRIK.grid)
+    squares = np.empty(FABRIK.grid)
     distances2(chain.arrays, ratio, grid, squares)
     rising = np.diff(squares) > 0.0
     cuts = {low, high}
@@ -249,8 +248,7 @@ def _branches(chain: Chain, ratio: float) -> Float:
 
 def _extremum(function: Callable[[float], float], low: float, high: float, *, maximum: bool) -> float:
     """By thirds: the curve is smooth and has one extremum inside."""
-    thirds = 52
-    for _ in range(thirds):
+    for _ in range(FABRIK.thirds):
         third = (high - low) / 3.0
         if (function(low + third) < function(high - third)) == maximum:
             low += third
@@ -260,11 +258,10 @@ def _extremum(function: Callable[[float], float], low: float, high: float, *, ma
 
 
 Stage = Callable[[str], AbstractContextManager[None]]
-FORGET_S = 0.5  # after this long without markers nothing is known of the hand any more
-_FIT_M2 = (3e-3) ** 2  # of a finger's marker as the palm's fit has it
+_FIT_M2 = FABRIK.fit_m**2
 _PALM_JOINTS = np.array([PALM, WRIST, *METACARPALS])
 _IN_VIEW = rigid(
-    np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6])
+    np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.5])
 )  # a hand before a camera at the origin
 
 
@@ -308,12 +305,11 @@ class FabrikSolver:
         self._finger_of = places.finger
         self._on_finger = self._finger_of >= 0
         at_tips = {int(self._finger_of[m]): m for m, mount in enumerate(mounts) if mount.joint in TIPS}
-        on_target_m = 1e-4
         self._fingers = {
-            m: (f, Finger.of(model, f, mounts[m].offset_m, on_target_m)) for f, m in at_tips.items()
+            m: (f, Finger.of(model, f, mounts[m].offset_m, FABRIK.target_m)) for f, m in at_tips.items()
         }
         self._last: SolvedHand | None = None
-        self._last_ns = -(2**62)
+        self._last_ns = NEVER_NS
 
     def push(self, message: MarkerDetections) -> list[HandEstimate]:
         """Take one camera's centroids; return the hands they complete, oldest first."""
@@ -365,19 +361,19 @@ class FabrikSolver:
     def rehearse(self) -> None:
         """Call every kernel once, so that none is compiled while a hand is tracked."""
         self.sync.at(0)
-        _, places = self._palm.pose(_IN_VIEW, np.full((5, 4), 0.2))
+        _, places = self._palm.pose(_IN_VIEW, np.full((5, 4), 0.5))
         points, cov = np.full((self._count, 3), np.nan), np.full((self._count, 3, 3), np.nan)
         points[self.on_hand], cov[self.on_hand] = places, 1e-6 * np.eye(3)
         seen = np.ones((len(self._centres), self._count))
         first = self.solve_once(points, cov, seen)
-        self.triangulate(100.0 * np.stack([seen, seen], axis=-1), seen, seen, first, 0.0)
+        self.triangulate(1e2 * np.stack([seen, seen], axis=-1), seen, seen, first, 0.0)
         targets = np.empty_like(places)
         targets_of(places, cov[self.on_hand], _IN_VIEW, places, _FIT_M2, targets)
 
     def _recent(self, t_ns: int) -> tuple[SolvedHand | None, float]:
         """Return the last hand, if it is still informative, and its age [s]."""
         age_s = (t_ns - self._last_ns) * 1e-9
-        if not self.continuous or self._last is None or not 0.0 < age_s <= FORGET_S:
+        if not self.continuous or self._last is None or not 0.0 < age_s <= FABRIK.forget_s:
             return None, 0.0
         return self._last, age_s
 
@@ -428,5 +424,4 @@ class FabrikSolver:
 
 def _drifted(hand: SolvedHand, age_s: float) -> SolvedHand:
     """A hand that was solved a time ago, as much less sure as it may have moved."""
-    held_m_s = 0.3  # of a hand that is held
-    return replace(hand, cov_m2=hand.cov_m2 + (held_m_s * age_s) ** 2 * np.eye(3))
+    return replace(hand, cov_m2=hand.cov_m2 + (FABRIK.held_m_s * age_s) ** 2 * np.eye(3))

@@ -36,33 +36,7 @@ from common.arrays import Bool, Float, Int
 from common.geometry.camera_model import CameraModel
 from common.kernels import inner, kernel
 from common.messages import MarkerDetections
-
-
-class PropagationSettings(NamedTuple):
-    """Numbers of the propagation of markers to one epoch."""
-
-    history: int = 8
-    observations: int = 4  # frames of one marker that are used: a fifth is too long ago to constrain anything
-    never: int = -(2**63)
-    # what is farther away a frame later is another thing
-    leap_m_s: float = 5.0
-    leap_px: float = 5.0
-    # Frames show the same cap in the same light, behind the same finger: most of an error stays from frame to
-    # frame, and no mean removes it. New in each is at most this part of the variance that the slave states, and
-    # this much.
-    independent_share: float = 0.7
-    independent_px: float = 0.1
-    # An error in time lies along the motion. One number for both axes cannot hold it: all of it covers too much
-    # (98-99 %), half, which keeps the sum of the axes, too little where the motion is along the baseline (87 %);
-    # this 93-97 %.
-    along: float = 0.75
-
-
-SETTINGS = PropagationSettings()
-# What hands do, per axis, as measured on recorded hands (docs/sync.md): laid down, gentle, brisk.
-_SPEED_M_S = (0.01, 1.0, 1.0)
-_ACCELERATION_M_S2 = (0.3, 1.5, 15.0)
-
+from master.fabrik.settings import NEVER_NS, SYNC
 
 Reach = tuple[int, int, int, int]
 
@@ -100,11 +74,11 @@ def propagate(
         When the last frame that was used was handed to its slave [ns] (none: the epoch), and whether there are
         alternatives.
     """
-    used, track = np.empty(SETTINGS.observations, np.int64), np.empty((SETTINGS.observations, 2, 4))
-    most = SETTINGS.observations
+    used, track = np.empty(SYNC.observations, np.int64), np.empty((SYNC.observations, 2, 4))
+    most = SYNC.observations
     known, L, z = np.empty((most, 5)), np.empty((most, most)), np.empty((most, 4))
     fit, mixed = np.empty(6 + most), np.empty(6 + most)
-    ready_ns, alternatives = SETTINGS.never, False
+    ready_ns, alternatives = NEVER_NS, False
     for c in range(len(history.total)):
         n = _around(history, c, t_ns, reach_ns, used)
         missing[c] = n == 0
@@ -116,7 +90,7 @@ def propagate(
             alternative = _read(history, c, m, t_ns, used, n, track)
             alternatives |= alternative
             if alternative:
-                _sort(track, n, SETTINGS.leap_m_s * scale)
+                _sort(track, n, SYNC.leap_m_s * scale)
             for i in range(2):
                 uv[i, c, m, 0] = uv[i, c, m, 1] = sigma[i, c, m] = nan
                 count = _select(track, n, i, scale, known) if alternative or i == 0 else 0
@@ -126,8 +100,8 @@ def propagate(
                     # Where independent noise would be amplified, so is that which is not new in each frame.
                     vary = mixed[3] + (_variance(track[0, i, 3]) - known[0, 4]) * max(gain, 1.0)
                     moved = t_sigma_s * t_sigma_s * (mixed[4] * mixed[4] + mixed[5] * mixed[5])
-                    sigma[i, c, m] = sqrt(vary + SETTINGS.along * moved)
-    return t_ns if ready_ns == SETTINGS.never else ready_ns, alternatives
+                    sigma[i, c, m] = sqrt(vary + SYNC.along * moved)
+    return t_ns if ready_ns == NEVER_NS else ready_ns, alternatives
 
 
 @inner
@@ -139,22 +113,22 @@ def _around(history: TrackHistory, c: int, t_ns: int, reach_ns: Reach, used: Int
     before), as if the others had not yet come: what comes out does not depend on how far a camera's messages
     ran ahead of another's.
     """
-    newest, oldest = history.total[c], max(history.total[c] - SETTINGS.history, 0)
+    newest, oldest = history.total[c], max(history.total[c] - SYNC.history, 0)
     after = newest
-    while after > oldest and history.times_ns[c, (after - 1) % SETTINGS.history, 0] >= t_ns:
+    while after > oldest and history.times_ns[c, (after - 1) % SYNC.history, 0] >= t_ns:
         after -= 1
     before, end, n = after - 1, min(after + (1 if after > oldest else 2), newest), 0
-    while n < SETTINGS.observations and (before >= oldest or after < end):
-        far_ns = 2**62
-        back_ns = t_ns - history.times_ns[c, before % SETTINGS.history, 0] if before >= oldest else far_ns
-        ahead_ns = history.times_ns[c, after % SETTINGS.history, 0] - t_ns if after < end else far_ns
+    while n < SYNC.observations and (before >= oldest or after < end):
+        far_ns = -2 * NEVER_NS
+        back_ns = t_ns - history.times_ns[c, before % SYNC.history, 0] if before >= oldest else far_ns
+        ahead_ns = history.times_ns[c, after % SYNC.history, 0] - t_ns if after < end else far_ns
         if min(back_ns, ahead_ns) > reach_ns[n]:
             break
         if back_ns <= ahead_ns:
-            used[n] = before % SETTINGS.history
+            used[n] = before % SYNC.history
             before -= 1
         else:
-            used[n] = after % SETTINGS.history
+            used[n] = after % SYNC.history
             after += 1
         n += 1
     return n
@@ -192,8 +166,7 @@ def _sort(track: Float, n: int, leap_px_s: float) -> None:
             straight += 0.0 if isnan(there) else there
             crossed += 0.0 if isnan(across) else across
             other |= not isnan(across)
-        swapped = 3.0  # times nearer to the other track: the slave's names are contradicted
-        if other and swapped * crossed < straight:
+        if other and SYNC.swapped * crossed < straight:
             for j in range(4):
                 track[k, 0, j], track[k, 1, j] = track[k, 1, j], track[k, 0, j]
         for i in range(2):
@@ -214,13 +187,12 @@ def _distance(track: Float, k: int, i: int, which: int, leap_px_s: float) -> flo
     if nearest < 0:  # also where the place itself is NaN
         return nan
     distance = hypot(track[nearest, i, 0] - track[k, which, 0], track[nearest, i, 1] - track[k, which, 1])
-    return distance if distance <= SETTINGS.leap_px + leap_px_s * gap_s else inf
+    return distance if distance <= SYNC.leap_px + leap_px_s * gap_s else inf
 
 
 @inner
 def _variance(sigma_px: float) -> float:
-    least_sigma_px = 0.01
-    return max(sigma_px, least_sigma_px) ** 2
+    return max(sigma_px, SYNC.least_px) ** 2
 
 
 @inner
@@ -232,12 +204,12 @@ def _select(track: Float, n: int, i: int, scale: float, known: Float) -> int:
     count = 0
     for k in range(n):
         u, v = track[k, i, 0] - track[0, i, 0], track[k, i, 1] - track[0, i, 1]
-        leap = SETTINGS.leap_px + SETTINGS.leap_m_s * scale * abs(track[k, i, 2] - track[0, i, 2])
+        leap = SYNC.leap_px + SYNC.leap_m_s * scale * abs(track[k, i, 2] - track[0, i, 2])
         if u * u + v * v <= leap * leap:  # false for NaN
             known[count, 0], known[count, 1], known[count, 2], known[count, 3] = 1.0, u, v, track[k, i, 2]
             known[count, 4] = min(
-                SETTINGS.independent_share * _variance(track[k, i, 3]),
-                SETTINGS.independent_px * SETTINGS.independent_px,
+                SYNC.independent_share * _variance(track[k, i, 3]),
+                SYNC.independent_px * SYNC.independent_px,
             )
             count += 1
     return count
@@ -251,8 +223,8 @@ def _mix(known: Float, n: int, scale: float, L: Float, z: Float, fit: Float, mix
     """
     mixed[:] = 0.0
     best = -inf
-    for k in range(len(_SPEED_M_S)):
-        speed, acceleration = _SPEED_M_S[k] * scale, _ACCELERATION_M_S2[k] * scale
+    for k in range(len(SYNC.speed_m_s)):
+        speed, acceleration = SYNC.speed_m_s[k] * scale, SYNC.acceleration_m_s2[k] * scale
         evidence = _fit(known, n, speed * speed, acceleration * acceleration, L, z, fit)
         fit[3] += 0.5 * (fit[1] * fit[1] + fit[2] * fit[2])
         keep, add = exp(min(best - evidence, 0.0)), exp(min(evidence - best, 0.0))
@@ -280,8 +252,7 @@ def _fit(known: Float, n: int, speed2: float, acceleration2: float, L: Float, z:
     for i in range(n):
         for j in range(i + 1):
             tt = known[i, 3] * known[j, 3]
-            w2 = 18.0**2  # [1/s^2] jerk by acceleration, and snap by jerk, squared
-            w2tt = w2 * tt
+            w2tt = SYNC.jerk_1_s**2 * tt
             s = tt * (speed2 + acceleration2 * tt * (1.0 / 4.0 + w2tt * (1.0 / 36.0 + w2tt / 576.0)))
             for k in range(j):
                 s -= L[i, k] * L[j, k]
@@ -312,12 +283,8 @@ def _fit(known: Float, n: int, speed2: float, acceleration2: float, L: Float, z:
         for k in range(i + 1, n):
             s -= L[k, i] * fit[6 + k]
         fit[6 + i] = s * L[i, i]
-    evidence = 0.5  # so they also constrain the motion less than as many independent ones
     # two axes: twice the logarithm of the determinant's root
-    return -evidence * (log(det * c) + 0.5 * residual2)
-
-
-SILENT_FRAMES = 12
+    return -SYNC.evidence * (log(det * c) + 0.5 * residual2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -360,32 +327,30 @@ class FrameSync:
         count, period_ns = len(models), int(1e9 / min(rates))
         self._markers, self._continuous = markers, continuous
         self._centre_row_ns = [round(0.5 * (model.height_px - 1) * model.row_time_ns) for model in models]
-        self._deadline_ns, self._stale_ns = int(1.25 * period_ns), SILENT_FRAMES * period_ns
-        self._half_ns = [int(0.5e9 / rate) for rate in rates]
+        self._deadline_ns, self._stale_ns = int(SYNC.deadline * period_ns), SYNC.silent_frames * period_ns
+        self._half_ns = [int(0.5 * 1e9 / rate) for rate in rates]
         self._slack_ns = self._half_ns if policy == "predict" else [0] * count
-        far_ns = int((SETTINGS.observations + 0.25) * period_ns) if continuous else -1
+        far_ns = int((SYNC.observations + SYNC.carried) * period_ns) if continuous else -1
         near_ns = self._deadline_ns if continuous else self._deadline_ns // 2
         self._reach_ns = near_ns, far_ns, far_ns, far_ns
-        self._patience = SILENT_FRAMES * count
-        slow = 2.2  # times as many frames of others as the files state, between so many of its own
-        self._slow_frames = [slow * sum(rates) / rate for rate in rates]
-        reach_m = 0.5  # where hands are, for what a camera makes of their motion
+        self._patience = SYNC.silent_frames * count
+        self._slow_frames = [SYNC.slow * sum(rates) / rate for rate in rates]
         self._history = TrackHistory(
             np.zeros(count, np.int64),
-            np.full((count, SETTINGS.history, 3), SETTINGS.never),
-            np.zeros((count, SETTINGS.history)),
-            np.full((count, SETTINGS.history, 6, markers), np.nan),
+            np.full((count, SYNC.history, 3), NEVER_NS),
+            np.zeros((count, SYNC.history)),
+            np.full((count, SYNC.history, 6, markers), np.nan),
             np.array([model.row_time_ns for model in models], np.float64),
-            np.array([model.matrix[0, 0] / reach_m for model in models]),
+            np.array([model.matrix[0, 0] / SYNC.away_m for model in models]),
         )
-        self._newest_of = [SETTINGS.never] * count  # centre rows
+        self._newest_of = [NEVER_NS] * count  # centre rows
         self._behind = [False] * count
         self._frames = 0  # of all cameras
         # How many those were at the last ones of each.
-        self._came: tuple[deque[int], ...] = tuple(deque(maxlen=SETTINGS.history) for _ in models)
+        self._came: tuple[deque[int], ...] = tuple(deque(maxlen=SYNC.history) for _ in models)
         self._awaited = 0  # the camera that was waited for when an epoch was last asked for
         self._pending: deque[int] = deque()
-        self._newest_ns = self._last_ns = SETTINGS.never  # of all frames, of all epochs
+        self._newest_ns = self._last_ns = NEVER_NS  # of all frames, of all epochs
         self.stale = 0
 
     def push(self, message: MarkerDetections) -> list[FrameSet]:
@@ -433,7 +398,7 @@ class FrameSync:
     def _hold(self, c: int, centre_ns: int, message: MarkerDetections) -> None:
         """Copy a frame into its camera's ring."""
         total, times_ns, t_sigma_ns, all_marks, _, _ = self._history
-        slot = int(total[c]) % SETTINGS.history
+        slot = int(total[c]) % SYNC.history
         total[c] += 1
         times_ns[c, slot, 0], times_ns[c, slot, 1] = centre_ns, message.t_ns
         times_ns[c, slot, 2], t_sigma_ns[c, slot] = message.ready_t_ns, message.t_sigma_ns
@@ -459,8 +424,7 @@ class FrameSync:
     def _slow(self, c: int) -> bool:
         """Whether a camera delivers too little to lead, by others and the files' rates."""
         at = self._came[c]
-        slow_frames = 4  # times as many frames of others as the files state, between so many of its own
-        return len(at) >= slow_frames and at[-1] - at[0] > self._slow_frames[c] * (len(at) - 1)
+        return len(at) >= SYNC.slow_frames and at[-1] - at[0] > self._slow_frames[c] * (len(at) - 1)
 
     def _emit(self, *, flush: bool) -> list[FrameSet]:
         out: list[FrameSet] = []

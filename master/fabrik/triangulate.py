@@ -25,10 +25,11 @@ from common.arrays import Bool, Float
 from common.geometry.camera_model import CameraModel
 from common.kernels import constant, inner, kernel
 from master.estimator.epoch import MarkerPositions, SolvedHand
-from master.fabrik.caps import CAPS, CapTables, hidden_part, seen_shift
+from master.fabrik.caps import CapTables, hidden_part, seen_shift
 from master.fabrik.depth import AffineDisparity, PowerLaw, disparity_on_axis
+from master.fabrik.settings import CAPS, DEPTH
 
-_DEPTHS_M = np.array([0.35, 0.45, 0.6, 0.8, 1.1])
+_DEPTHS_M = np.array(DEPTH.tabled_m)
 _ONE = constant(1)  # direction
 
 
@@ -63,7 +64,7 @@ def disparity_tables(
 ) -> DisparityTables:
     """Tabulate the first two cameras over the left image; as of `DisparityTables`."""
     left, right = cameras[:2]
-    grid = 48  # cells of the table along each side of the image
+    grid = DEPTH.grid
     u = np.linspace(0.0, left.width_px, grid + 1)
     v = np.linspace(0.0, left.height_px, grid + 1)
     uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
@@ -140,8 +141,7 @@ def place_centroids(
         cell[c] = (1.0 - p) * upper + p * lower
     disparity = u - right_u
     z = depth(tables, disparity)
-    law_rounds = 3  # each leaves a thousandth of the correction off the axis
-    for _ in range(law_rounds):
+    for _ in range(DEPTH.rounds):
         z = depth(tables, disparity - cell[0] - cell[1] / z)
     if not np.isfinite(z):
         return np.nan, np.nan
@@ -352,8 +352,7 @@ def triangulate(
                 continue
             _cap_spread(tables, caps, uv, m, ahead[m], tilt[m], work, points, cov)
         else:
-            anyhow_m2 = (4e-3) ** 2  # of a cap's seen centroid while nothing measures where the finger points
-            spread2 = anyhow_m2 if row >= 0 else CAPS.relief_m**2
+            spread2 = CAPS.any_m**2 if row >= 0 else CAPS.relief_m**2
             for a in range(3):
                 points[m, a] = point[a]
                 for b in range(3):
@@ -400,9 +399,7 @@ class DepthTriangulator:
         if hand is not None:
             ahead, tilt = self._caps.pointing(hand, age_s)
         elif not as_seen:
-            # standard deviation of the direction of a finger that shows its end, from that to the cameras
-            anyhow_rad = 1.0
-            ahead[self._caps.row >= 0], tilt[:] = -self._tables.R[:, 2], anyhow_rad**2 * np.eye(3)
+            ahead[self._caps.row >= 0], tilt[:] = -self._tables.R[:, 2], CAPS.any_rad**2 * np.eye(3)
         points, cov = np.empty((count, 3)), np.empty((count, 3, 3))
         noise, outliers = np.empty((count, 3, 3)), np.empty(count, np.bool_)
         triangulate(

@@ -46,7 +46,7 @@ from scipy.special import ndtr, stdtrit
 from common.arrays import Bool, Float, Int
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import cross, invert
-from master.fabrik.intersection import RAYS
+from master.fabrik.settings import RAYS
 
 
 @dataclass(frozen=True, slots=True, eq=False)

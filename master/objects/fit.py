@@ -27,7 +27,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.geometry.transforms import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix, skew
 from master.estimator.sensors import CameraArrays
-from master.fabrik.intersection import RAYS
+from master.fabrik.settings import RAYS
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,7 +23,7 @@ from common.arrays import Bool, Float, Int
 from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections, TagDetections
 from master.fabrik.caps import LensShift
-from master.fabrik.sync import SETTINGS, SILENT_FRAMES
+from master.fabrik.settings import SYNC
 from master.objects.surface import Features
 
 _PERIOD_NS = 16_666_667  # until it is measured from frames
@@ -84,7 +84,7 @@ class Windows:
         self._names, self._cameras = tuple(cameras), tuple(cameras.values())
         self._features, self._predict, self._late_ns = features, predict, dict(late_ns or {})
         self._shift = [LensShift((camera,)) for camera in self._cameras]
-        kept = SETTINGS.history
+        kept = SYNC.history
         self._seen = [
             (deque[ImageObservation](maxlen=kept), deque[ImageObservation](maxlen=kept)) for _ in self._names
         ]
@@ -145,7 +145,7 @@ class Windows:
         )
 
     def _silent(self, c: int) -> bool:
-        return self._waiting[c] >= SILENT_FRAMES * len(self._names)
+        return self._waiting[c] >= SYNC.silent_frames * len(self._names)
 
     def _observation(
         self, message: MarkerDetections | TagDetections, c: int, t_ns: int, centre_ns: int
@@ -216,7 +216,7 @@ class Windows:
 
     def _at(self, t_ns: int, period_ns: int) -> Window:
         assert self._origin_ns is not None
-        reach_ns = round((SETTINGS.observations + 0.25) * period_ns)
+        reach_ns = round((SYNC.observations + 0.25) * period_ns)
         views = tuple(
             (_around(markers, t_ns, reach_ns), _around(tags, t_ns, reach_ns)) for markers, tags in self._seen
         )
@@ -233,9 +233,9 @@ def _around(line: deque[ImageObservation], t_ns: int, reach_ns: int) -> tuple[Im
     """
     known = list(line)
     before = sum(s.centre_ns < t_ns for s in known)
-    associated = known[max(before - SETTINGS.observations, 0) : max(before + 1, 2)]
+    associated = known[max(before - SYNC.observations, 0) : max(before + 1, 2)]
     near = [s for s in associated if abs(s.centre_ns - t_ns) <= reach_ns]
-    return tuple(sorted(near, key=lambda s: abs(s.centre_ns - t_ns))[: SETTINGS.observations])
+    return tuple(sorted(near, key=lambda s: abs(s.centre_ns - t_ns))[: SYNC.observations])
 
 
 class Hidden:

@@ -21,10 +21,11 @@ from master.estimator.settings import Settings
 from master.estimator.smoothing import HandOneEuro
 from master.estimator.wrist_pipeline import WristPipeline, WristSide
 from master.fabrik.caps import CapTables
-from master.fabrik.depth import LAW_RESIDUAL, CalibrationResidual, depth_law, law_contradicts, law_residual
-from master.fabrik.intersection import RAYS, limits_of, rehearse
+from master.fabrik.depth import CalibrationResidual, depth_law, law_contradicts, law_residual
+from master.fabrik.intersection import limits_of, rehearse
 from master.fabrik.one_euro import OneEuroParameters, PointFilter
 from master.fabrik.rays import RayTriangulator
+from master.fabrik.settings import DEPTH, RAYS
 from master.fabrik.solver import FabrikSolver, Stage
 from master.fabrik.sync import FrameSync
 from master.fabrik.triangulate import DepthTriangulator, disparity_tables
@@ -131,7 +132,7 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
                 " 'fabrik', which takes the depth alone"
             )
         off, _ = law_residual(law, cameras, rig.volume)
-        tilt_px = 0.0 if off <= LAW_RESIDUAL else float(cameras[0].matrix[1, 1]) * _MOUNTED_RAD
+        tilt_px = 0.0 if off <= DEPTH.law_residual else float(cameras[0].matrix[1, 1]) * _MOUNTED_RAD
         row_px = hypot(sqrt(2.0) * RAYS.rig_px, tilt_px)
         tables = disparity_tables(cameras, law, residual.law, row_px, float(limits_of(2)[2]))
         triangulate = DepthTriangulator(tables, CapTables.of(setup.hand, rig.markers))

@@ -5,7 +5,8 @@ import numpy as np
 from common.arrays import Float
 from common.geometry.camera_model import CameraModel
 from master.estimator.sensors import CameraArrays
-from master.fabrik.intersection import SETTINGS, Association, Prior, among, associate
+from master.fabrik.intersection import Association, Prior, among, associate
+from master.fabrik.settings import ASSOCIATION
 from master.rig.pipeline import line_of
 from master.run.app import StageTimes
 from tests.hand_helpers import (
@@ -48,8 +49,8 @@ def choose(
     def rows(place: Float | None) -> Float:
         return np.tile(np.full(3, np.nan) if place is None else place, (count, 1))
 
-    age_s = np.full(count, (past[1] - SETTINGS.place_m) / SETTINGS.speed_m_s)
-    model = hand[1] ** 2 - SETTINGS.model_m**2
+    age_s = np.full(count, (past[1] - ASSOCIATION.place_m) / ASSOCIATION.speed_m_s)
+    model = hand[1] ** 2 - ASSOCIATION.model_m**2
     prior = Prior(rows(hand[0]), np.tile(model * np.eye(3), (count, 1, 1)))
     area = np.where(np.isnan(first[..., 0]), np.nan, 400.0)
     pixels = first, sigmas[0], area
@@ -150,7 +151,7 @@ def test_many_cameras_with_alternatives_are_associated_from_the_first_five_and_t
 def test_a_past_that_is_too_old_says_nothing() -> None:
     first, second = seen(PAIR, IN_ROW, MARKER), seen(PAIR, MARKER, None)
     assert choose(PAIR, first, second, near(MARKER, 0.05)).taken.all()
-    assert not choose(PAIR, first, second, near(MARKER, SETTINGS.forget_s + 0.02)).taken.any()
+    assert not choose(PAIR, first, second, near(MARKER, ASSOCIATION.forget_s + 0.02)).taken.any()
 
 
 def test_a_second_place_has_no_area_and_a_first_one_keeps_its_own() -> None:
@@ -170,7 +171,7 @@ def test_a_prediction_by_the_other_markers_covers_where_the_marker_is() -> None:
         hand = line.solve_once(clear, small_cov(), np.full((2, 6), 100.0))
         assert hand is not None
         joint = RIGHT.mount(MARKERS[m]).joint
-        cov = hand.cov_m2[0 if joint is None else joint] + SETTINGS.model_m**2 * np.eye(3)
+        cov = hand.cov_m2[0 if joint is None else joint] + ASSOCIATION.model_m**2 * np.eye(3)
         off = true[m] - RIGHT.marker_points(hand.joints, MARKERS)[m]
         squared.append(float(off @ np.linalg.solve(cov, off)))
         assert np.sqrt(np.trace(cov)) < 0.2

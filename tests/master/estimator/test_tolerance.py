@@ -6,7 +6,8 @@ from bench.hands.draws import PointHand
 from common.arrays import Float
 from common.hand.model import HandModel
 from common.hand.profiles import generated_profile
-from master.estimator.parameters import REACH, HandParameters
+from master.estimator.parameters import HandParameters
+from master.estimator.settings import KERNEL
 from tests.hand_helpers import BACK_NORMAL, MARKERS, RIGHT, palm
 
 SOFT = HandModel.of(generated_profile("soft", "right"))
@@ -37,7 +38,7 @@ def test_knuckles_that_bend_back_are_followed_and_walls_are_not_passed() -> None
 
 def test_nobody_is_three_standard_deviations_beyond() -> None:
     found = solved(SOFT, bent_back(35.0))
-    assert (found[1:, 1] >= -REACH * SOFT.tolerance_rad[1:, 1] - 1e-9).all()
+    assert (found[1:, 1] >= -KERNEL.tolerances * SOFT.tolerance_rad[1:, 1] - 1e-9).all()
 
 
 def test_inside_its_limits_a_hand_is_as_it_was() -> None:
@@ -50,7 +51,7 @@ def test_inside_its_limits_a_hand_is_as_it_was() -> None:
 def test_the_box_is_that_of_the_limits_and_their_reach() -> None:
     parameters = HandParameters.of(SOFT)
     sigma = SOFT.tolerance_rad.reshape(20)[parameters.free]
-    np.testing.assert_allclose(parameters.legal_low - parameters.low, REACH * sigma)
+    np.testing.assert_allclose(parameters.legal_low - parameters.low, KERNEL.tolerances * sigma)
     np.testing.assert_allclose(parameters.beyond_w2, sigma**-2.0)
     walls = HandParameters.of(RIGHT)
     np.testing.assert_array_equal(walls.low, walls.legal_low)

@@ -12,8 +12,9 @@ from common.geometry.camera_model import CameraModel
 from common.hand.model import HandJoints
 from common.recording.frame_recording import open_recording
 from master.estimator.sensors import CameraArrays
-from master.fabrik.caps import TILTED, CapTables, cap_surface, hidden_part, tilted
+from master.fabrik.caps import CapTables, cap_surface, hidden_part, tilted
 from master.fabrik.intersection import triangulate
+from master.fabrik.settings import CAPS
 from tests.hand_helpers import (
     MARKERS,
     RIGHT,
@@ -27,11 +28,11 @@ from tests.hand_helpers import (
 )
 
 CAMERAS = tuple(camera_models(rig_file()).values())
-CAPS = CapTables.of(RIGHT, MARKERS)
+TABLES = CapTables.of(RIGHT, MARKERS)
 RADIUS_M = 0.038 * 0.19  # index tip of the generated hand; its cap's centroid lies 0.15 of it ahead
 
 
-def hidden_px(area_px2: Float, points: Float, whole_m2: Float, caps: CapTables = CAPS) -> Float:
+def hidden_px(area_px2: Float, points: Float, whole_m2: Float, caps: CapTables = TABLES) -> Float:
     """Standard deviation (C, M) [px] that occlusion adds, of areas (C, M) and whole ones (T, C, M)."""
     away = np.stack([np.linalg.norm(points - camera.centre, axis=1) for camera in CAMERAS])
     out = np.empty_like(area_px2)
@@ -102,7 +103,7 @@ def test_markers_without_caps_have_no_tables_and_the_same_hand_has_its_own_once(
     assert len(back.appearances) == len(back.radius_m) == 0
     points = np.array([[0.0, 0.0, 0.5]] * 2)
     np.testing.assert_array_equal(hidden_px(np.full((2, 2), 3.0), points, np.zeros((1, 2, 2)), back), 0.0)
-    assert CapTables.of(RIGHT, MARKERS) is CAPS
+    assert CapTables.of(RIGHT, MARKERS) is TABLES
 
 
 @pytest.mark.filterwarnings("error")
@@ -170,13 +171,13 @@ def test_a_cap_shows_a_disc_from_its_end_and_its_whole_length_from_the_side() ->
 
 def test_a_sure_pose_is_not_tilted_and_an_uncertain_one_about_its_own() -> None:
     R, sd = np.eye(3)[None], np.array([0.2, 0.05])
-    sure, unsure = np.empty((TILTED, 3)), np.empty((TILTED, 3))
+    sure, unsure = np.empty((CAPS.tilted, 3)), np.empty((CAPS.tilted, 3))
     tilted(0, R, np.zeros((1, 3, 3)), 0.0, sure)
-    np.testing.assert_allclose(sure, np.broadcast_to([0.0, 0.0, -1.0], (TILTED, 3)), atol=1e-12)
+    np.testing.assert_allclose(sure, np.broadcast_to([0.0, 0.0, -1.0], (CAPS.tilted, 3)), atol=1e-12)
     tilted(0, R, np.diag([*sd**2, 0.0])[None], 0.0, unsure)
     np.testing.assert_allclose(np.linalg.norm(unsure, axis=-1), 1.0)
     np.testing.assert_allclose(np.sqrt((unsure[1:, :2] ** 2).mean(axis=0)), sd, rtol=0.05)
-    old = np.empty((TILTED, 3))
+    old = np.empty((CAPS.tilted, 3))
     tilted(0, R, np.zeros((1, 3, 3)), 0.1**2, old)  # its age alone
     np.testing.assert_allclose(np.sqrt((old[1:, :2] ** 2).mean(axis=0)), [0.1, 0.1], rtol=0.05)
 

@@ -171,7 +171,7 @@ def test_a_rig_file_s_settings_are_the_parameters() -> None:
 
 
 def test_shape_is_kept_and_may_not_change() -> None:
-    machine = OneEuro(OneEuroParameters())
+    machine = OneEuro(PAPER)
     assert machine.push(0, np.full((6, 3), np.nan)).shape == (6, 3)
     with pytest.raises(ValueError, match="shape"):
         machine.push(1, np.zeros(18))

@@ -14,8 +14,9 @@ from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import axis_rotation, rigid
 from master.estimator.sensors import CameraArrays
 from master.fabrik.caps import CapTables
-from master.fabrik.intersection import RAYS, Triangulation, limits_of, triangulate
+from master.fabrik.intersection import Triangulation, limits_of, triangulate
 from master.fabrik.rays import RayTriangulator
+from master.fabrik.settings import RAYS
 from tests.hand_helpers import camera_models, rig_file
 
 MATRIX = np.array([[503.0, 0.0, 319.5], [0.0, 507.0, 239.5], [0.0, 0.0, 1.0]])

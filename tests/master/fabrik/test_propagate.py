@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from master.fabrik.sync import SETTINGS, FrameSet, Reach, TrackHistory, propagate
+from master.fabrik.settings import NEVER_NS, SYNC
+from master.fabrik.sync import FrameSet, Reach, TrackHistory, propagate
 
 MS = 1e6
 PX_M = 1000.0
@@ -38,9 +39,9 @@ class Frame:
 
 def history(views: list[list[Frame]], scale: Float, row_time_ns: float = 0.0) -> TrackHistory:
     """As `FrameSync` holds them, in any order."""
-    shape, markers = (len(views), SETTINGS.history), max(len(one.uv) for view in views for one in view)
+    shape, markers = (len(views), SYNC.history), max(len(one.uv) for view in views for one in view)
     times, marks, t_sigma = (
-        np.full((*shape, 3), SETTINGS.never),
+        np.full((*shape, 3), NEVER_NS),
         np.full((*shape, 6, markers), np.nan),
         np.zeros(shape),
     )
@@ -185,7 +186,7 @@ def test_a_marker_at_rest_is_no_less_steady_than_its_observations(
     times: tuple[float, ...], most_px: float
 ) -> None:
     rng = np.random.default_rng(2)
-    noise = rng.normal(0.0, 0.1, (SETTINGS.observations, 4000, 2))
+    noise = rng.normal(0.0, 0.1, (SYNC.observations, 4000, 2))
     found = propagate_one(seen(times, 300.0 + noise))
     assert (found.uv - 300.0).std() < most_px
 
@@ -202,7 +203,7 @@ def test_sigma_covers_the_error_of_a_swinging_hand(times: tuple[float, ...], pea
         return 300.0 + PX_M * peak_m_s2 / turn**2 * np.sin(turn * t_s + phase)
 
     t = np.array(times)[:, None, None] * 1e-3
-    found = propagate_one(seen(times, place(t) + rng.normal(0.0, 0.1, (SETTINGS.observations, 2000, 2))))
+    found = propagate_one(seen(times, place(t) + rng.normal(0.0, 0.1, (SYNC.observations, 2000, 2))))
     error = np.abs(found.uv - place(0.0)) / found.sigma_px[:, None]
     assert 0.9 < (error < 1.96).mean() < 0.995
     assert np.median(found.sigma_px) < (0.25 if times is PAST else 1.6)  # and says something
@@ -214,7 +215,7 @@ def test_a_shifted_picture_or_a_clock_that_began_elsewhere_changes_nothing(
     seed: int, shift: float, late_ms: float
 ) -> None:
     rng = np.random.default_rng(seed)
-    places = 300.0 + rng.normal(0.0, 3.0, (SETTINGS.observations, 5, 2))
+    places = 300.0 + rng.normal(0.0, 3.0, (SYNC.observations, 5, 2))
     plain = propagate_one(seen(PAST, places))
     shifted = propagate_one(seen(PAST, places + shift))
     np.testing.assert_allclose(shifted.uv, plain.uv + shift, atol=1e-8)
@@ -236,7 +237,7 @@ def test_a_time_error_adds_with_the_speed() -> None:
 
 
 def test_a_jump_farther_than_a_hand_goes_is_another_thing_also_without_an_alternative() -> None:
-    places = np.full((SETTINGS.observations, 1, 2), 300.0)
+    places = np.full((SYNC.observations, 1, 2), 300.0)
     jumped = places.copy()
     jumped[1:] += 200.0
     held = propagate_one(seen(PAST[:1], places[:1]))
@@ -262,7 +263,7 @@ def test_an_observation_that_missed_the_marker_leaves_a_gap_and_no_more() -> Non
 
 def test_cameras_are_carried_each_by_itself() -> None:
     rng = np.random.default_rng(4)
-    places = 300.0 + rng.normal(0.0, 2.0, (2, SETTINGS.observations, 3, 2))
+    places = 300.0 + rng.normal(0.0, 2.0, (2, SYNC.observations, 3, 2))
     views = [seen(PAST, places[0]), seen(AHEAD[:2], places[1][:2]), []]
     scale = np.array([1000.0, 700.0, 900.0])
     paired = carried(history(views, scale))
@@ -300,7 +301,7 @@ def by_formula(t_s: Float, y: Float, sigma: Float) -> tuple[Float, float]:
     return mean, spread + (sigma[0] ** 2 - fresh[0]) * max(gain, 1.0)
 
 
-@given(st.integers(0, 10_000), st.integers(1, SETTINGS.observations), st.sampled_from([PAST, AHEAD]))
+@given(st.integers(0, 10_000), st.integers(1, SYNC.observations), st.sampled_from([PAST, AHEAD]))
 @settings(max_examples=60)
 def test_place_and_variance_are_those_of_the_formula(seed: int, count: int, times: tuple[float, ...]) -> None:
     rng = np.random.default_rng(seed)
@@ -329,7 +330,7 @@ def examples() -> list[list[float]]:
     for _ in range(40):
         views = list[list[Frame]]()
         for _ in range(3):
-            times = np.cumsum(rng.uniform(8.0, 24.0, rng.integers(1, SETTINGS.history))) - 70.0
+            times = np.cumsum(rng.uniform(8.0, 24.0, rng.integers(1, SYNC.history))) - 70.0
             way = rng.uniform(100.0, 300.0, (1, 4, 2)) + times[:, None, None] * rng.normal(0.0, 0.6, (4, 2))
             places = way + rng.normal(0.0, 0.2, way.shape)
             alternatives = places + rng.uniform(-50.0, 50.0, places.shape)

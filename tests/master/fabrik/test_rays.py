@@ -11,9 +11,10 @@ from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import rigid
 from common.hand.model import TIPS, HandJoints
 from master.estimator.epoch import MarkerPositions, SolvedHand
-from master.fabrik.caps import CAPS, CapTables
+from master.fabrik.caps import CapTables
 from master.fabrik.depth import CalibrationResidual
 from master.fabrik.rays import RayTriangulator
+from master.fabrik.settings import CAPS
 from tests.hand_helpers import (
     MARKERS,
     RIGHT,

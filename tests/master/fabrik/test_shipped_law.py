@@ -9,7 +9,8 @@ from common.arrays import Float
 from master.estimator.sensors import CameraArrays
 from master.fabrik.caps import CapTables
 from master.fabrik.depth import CalibrationResidual, depth_law, law_residual
-from master.fabrik.intersection import RAYS, limits_of, triangulate
+from master.fabrik.intersection import limits_of, triangulate
+from master.fabrik.settings import RAYS
 from master.fabrik.triangulate import DepthTriangulator, disparity_tables
 from master.rig.setup import RigSetup, load_setup
 

@@ -8,7 +8,8 @@ from common.calibration import AffineDisparityCalibration
 from common.hand.model import CHAINS, TIPS
 from common.messages import MarkerDetections, Source
 from master.estimator.epoch import HandEstimate
-from master.fabrik.solver import FORGET_S, FabrikSolver
+from master.fabrik.settings import FABRIK
+from master.fabrik.solver import FabrikSolver
 from master.rig.pipeline import build_pipeline, line_of
 from master.run.app import StageTimes
 from tests.hand_helpers import RIGHT, detections
@@ -100,7 +101,7 @@ def test_one_camera_lost_the_line_says_so_holds_and_comes_back(run: SyntheticRun
         if hand.t_ns - since < 0.4e9:
             assert hand.valid.all()
             assert hand.solution is not None
-        if hand.t_ns - since > 1e9 * (FORGET_S + 0.05):
+        if hand.t_ns - since > 1e9 * (FABRIK.forget_s + 0.05):
             assert not hand.valid.any()
             assert hand.solution is None
     cov = [np.trace(hand.solution.cov_m2[0]) for hand in gone if hand.solution is not None]

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.messages import MarkerDetections
-from master.fabrik.sync import SETTINGS, SILENT_FRAMES, FrameSet, FrameSync
+from master.fabrik.settings import SYNC
+from master.fabrik.sync import FrameSet, FrameSync
 from tests.hand_helpers import camera_models, detections, rig_file
 
 MS = 1_000_000
@@ -246,7 +247,7 @@ def test_when_the_leader_falls_silent_the_next_camera_leads() -> None:
     times = np.array([i.t_ns for i in epochs])
     assert (np.diff(times) > 0).all()
     after = [i for i in epochs if i.t_ns > 10 * PERIOD]
-    assert len(after) >= 80 - 10 - 2 * SILENT_FRAMES - 1
+    assert len(after) >= 80 - 10 - 2 * SYNC.silent_frames - 1
     assert all(i.missing[0] and not i.missing[1] for i in after)
     assert all(i.t_ns % PERIOD == 5 * MS for i in after)
 
@@ -291,7 +292,7 @@ def test_a_clock_that_steps_back_is_ignored_until_time_goes_on() -> None:
 
 @pytest.mark.parametrize("first", ["left", "right"])
 @pytest.mark.parametrize(
-    ("pause", "kept"), [(SILENT_FRAMES - 2, True), (SILENT_FRAMES + 2, False), (300, False)]
+    ("pause", "kept"), [(SYNC.silent_frames - 2, True), (SYNC.silent_frames + 2, False), (300, False)]
 )
 def test_what_waited_for_a_partner_while_nothing_came_is_left_out(pause: int, kept: bool, first: str) -> None:
     """A cable is out between the leader's frame and its partner's: the pose would be as old as the cut."""
@@ -366,7 +367,7 @@ def test_what_was_emitted_stays_as_it_was() -> None:
 
 def test_an_epoch_older_than_all_that_is_held_has_no_frame() -> None:
     machine = sync()
-    for k in range(2 * SETTINGS.history):
+    for k in range(2 * SYNC.history):
         machine.push(frame("left", k, k * PERIOD))
     found = machine.at(0)
     assert found.missing.all()
