@@ -126,6 +126,12 @@ PRIVATE = frozenset(
         "mounting",
     }
 )
+# Numbers of formulas, sizes of what hands and vectors have, and units; what is less or more is of rounding or ns.
+FORMULA = frozenset({3, 4, 5, 6, 7, 8, 12, 36, 576, 1e2, 1e3})
+ROUNDING, HUGE, JOINTS = 1e-5, 1e9, 26
+SHAPES = frozenset(
+    {"range", "array", "part", "empty", "zeros", "ones", "full", "eye", "arange", "reshape", "slice"}
+)
 FIRST_LINE, FILE_LINES = 79, 580
 SHARED = frozenset({"common"})  # nothing enters or leaves the language of both sides
 # No more than there are: each change leaves fewer.
@@ -328,6 +334,39 @@ def _words(name: str) -> frozenset[str]:
     return frozenset(part.lower() for part in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", name))
 
 
+def numbers(path: str, text: str) -> set[str]:
+    """Numbers in the pose's rooms that belong into their settings.
+
+    Anywhere stand 0, 1, 2, a half, -1 and what guards rounding; within an index, slice, shape or range whole numbers
+    up to the joints of a hand; within an expression `FORMULA`. What a name alone is set to is a setting, but for a
+    layout: several names in capitals at once.
+    """
+    if not re.match(r"master/(estimator|fabrik)/(?!settings\.py)", path):
+        return set()
+    return set(_settings_in(tree_of(text), whole=False, inside=False))
+
+
+def _settings_in(node: ast.AST, *, whole: bool, inside: bool) -> Iterator[str]:
+    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+        size = abs(node.value)
+        plain = size in {0, 0.5, 1, 2} or size <= ROUNDING or size >= HUGE
+        in_shape = inside and type(size) is int and size <= JOINTS
+        if not (plain or in_shape or (size in FORMULA and not whole)):
+            yield f"line {node.lineno}: {node.value}"
+    layout = isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple)
+    layout = layout and all(name.isupper() for name in re.findall(r"\w+", ast.unparse(node.targets[0])))
+    for key, value in ast.iter_fields(node):
+        bound = key in {"value", "defaults", "kw_defaults"} and not isinstance(node, ast.AugAssign)
+        bound = (bound or (whole and isinstance(node, ast.Tuple | ast.UnaryOp))) and not layout
+        index = key == "slice" or (key == "args" and isinstance(node, ast.Call) and called(node) in SHAPES)
+        within = inside and isinstance(
+            node, ast.BinOp | ast.UnaryOp | ast.Tuple | ast.Slice | ast.Call | ast.Starred
+        )
+        for child in value if isinstance(value, list) else [value]:
+            if isinstance(child, ast.AST):
+                yield from _settings_in(child, whole=bound, inside=index or layout or within)
+
+
 def long_first_lines(path: str, text: str) -> set[str]:
     """Docstrings whose first line is longer than 79 characters."""
     lines = [
@@ -438,6 +477,11 @@ PLANTED: list[tuple[Guard, str, str, str]] = [
     (private_words, "master/x.py", "class HandBelief: ...", "class HandPrior: ..."),
     (private_words, "master/x.py", "def f():\n    global told", "def f():\n    global x  # told 'doubt'"),
     (private_words, "master/x.py", "from a import doubt as x", "x = 'doubt'"),
+    (numbers, "master/fabrik/x.py", "def f(x):\n    return x < 0.02", "def f(x):\n    return x < 1e-9"),
+    (numbers, "master/estimator/x.py", "gate = 4.0", "root = sqrt(4.0 * a)"),
+    (numbers, "master/estimator/x.py", "def f(most=5): ...", "x = np.empty((26, 3))[:, 20]"),
+    (numbers, "master/estimator/x.py", "NODES = 16", "FIRST, LAST = 9, 18"),
+    (numbers, "master/estimator/x.py", "f(wide=-7.0)", "GATE = SETTINGS.gate"),
     (long_first_lines, "master/x.py", f'"""{80 * "x"}"""', f'"""{79 * "x"}\n\n{80 * "x"}"""'),
     (too_long, "master/x.py", 581 * "\n", 580 * "\n"),
     (

@@ -35,7 +35,7 @@ from master.estimator.sensors import (
     in_image,
     observe_wrist,
 )
-from master.estimator.settings import Settings
+from master.estimator.settings import KERNEL, Settings
 from master.estimator.solve import Blank
 from master.estimator.state import stationary_of, unknown_hand
 from master.estimator.update import Estimate, fit_epoch, predict_epoch, take_over_epoch
@@ -210,7 +210,6 @@ class EpochSteps:
         self._cycle_rows = self._space["epoch_prior"]["cycle_rows"]
         hand, device = boxed(HandTables.of(model, parameters)), boxed(device)
         self._model = Model(hand, boxed(settings.record()), mounts, self._cameras, device)
-        self.at.scratch.search.wrist_share[0] = settings.wrist_share
         self.at.epoch_prior.z_info[0, 0] = 1.0  # of a rig without wrist device: one extra that means nothing
         if wrist is not None:
             self._lay_out(wrist)
@@ -363,8 +362,7 @@ class EpochSteps:
 
 def _capacity(markers: int) -> int:
     """Round a count of markers up, so that kernels are compiled once for most rigs."""
-    step = 16
-    return max(-(-markers // step), 1) * step
+    return max(-(-markers // KERNEL.markers), 1) * KERNEL.markers
 
 
 def count_fingers(counts: Counter[str], event: str, fingers: Bool) -> None:

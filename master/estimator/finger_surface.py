@@ -27,7 +27,7 @@ from master.estimator.settings import KERNEL
 # Abduction, flexion, PIP, DIP, twist, and the wrist's flexion and deviation; all, those of the finger itself, none.
 MOVES, OWN_MOVES, NO_MOVES = constant(7), constant(5), constant(0)
 _BONE = np.array([0, 0, 0, 0, 1, 1, 2, 2])
-_ROOT = 4  # spheres of the first bone, which of a thumb is in its ball
+_ROOT = int((_BONE == 0).sum())  # spheres of the first bone, which of a thumb is in its ball
 RAYS = KERNEL.rays
 
 
@@ -91,10 +91,9 @@ def spheres(device: Any, f: int, work: Surface) -> None:
 
 @inner
 def crossing(device: Any, f: int, work: Surface) -> int:
-    """Write where the ridge of finger f crosses the plane, and its direction.
+    """Write where finger f's ridge crosses the plane; return the bone.
 
-    Returns:
-        The stretch on which it does, plus 16 where the chain does not reach the plane and was prolonged.
+    A chain that does not reach the plane is prolonged. `work.way`: direction of the ridge there.
     """
     S, Q, along, laser = work.S, work.Q, work.along, device.laser_m
     for k in range(8):
@@ -142,7 +141,7 @@ def crossing(device: Any, f: int, work: Surface) -> int:
         w = Q[at + 1, i] - Q[at, i]
         work.q[i] = Q[at, i] + share * w
         work.way[i] = w + (held - rise) * n[i]
-    return at if met else at + 16
+    return int(_BONE[at])
 
 
 @inlined
@@ -321,18 +320,16 @@ def look(
     f: int,
     moves: int,
     work: Surface,
-) -> int:
+) -> None:
     """Write what is seen of finger f by ridge and tip to `seen`, derivatives to `J`.
 
     `T` (4, 4) palm, camera frame, `wrist_axes` (2, 3) as of `flexed_palm`, `angles` (20,) [rad]; `moves`: by
-    how many of `MOVES` derivatives are wanted. Returns the stretch of the ridge that is lit, as of
-    `crossing`.
+    how many of `MOVES` derivatives are wanted.
     """
     R, P, A, J, seen = work.R, work.P, work.axis, work.J, work.seen
     finger_chain(hand, T, angles, f, R, P)
     spheres(device, f, work)
-    at = crossing(device, f, work)
-    bone = _BONE[min(at & 15, 7)]
+    bone = crossing(device, f, work)
     n, q, w, t = device.plane[2], work.q, work.way, work.tip
     rise = n[0] * w[0] + n[1] * w[1] + n[2] * w[2]
     for i in range(3):
@@ -343,7 +340,7 @@ def look(
     tx, ty = t[0] / t[2], t[1] / t[2]
     seen[0], seen[1], seen[2], seen[3], seen[4] = x, y, tx, ty, log(max(t[2], KERNEL.nearest_m))
     if moves == 0:
-        return at
+        return
     for k in range(4):
         A[k, 0], A[k, 1], A[k, 2] = hinge_axis(hand, T, R, f, k)
     for i in range(3):
@@ -375,4 +372,3 @@ def look(
         dx, dy, dz = t[0] - ox, t[1] - oy, t[2] - oz
         vx, vy, vz = ay * dz - az * dy, az * dx - ax * dz, ax * dy - ay * dx
         J[2, k], J[3, k], J[4, k] = (vx - tx * vz) / t[2], (vy - ty * vz) / t[2], vz / t[2]
-    return at

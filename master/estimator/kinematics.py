@@ -267,16 +267,16 @@ def marker_jacobian(
 
     By the palm (6), then by the free angles of its finger. Returns how many, and the column of the first angle.
     """
-    f, size, start = mounts.finger[m], 6, 0
+    f = mounts.finger[m]
     marker_point(mounts, m, T, work, work.point)
     for i in range(3):
         work.arm[i] = work.point[i] - T[i, 3]
     palm_jacobian(work.arm, J)
-    if f >= 0:
-        start = int(tables.first[f])
-        size += int(tables.first[f + 1]) - start
-        finger_jacobian(tables, T, work, f, mounts.level[m], work.point, PLACE, J)
-    return size, start
+    if f < 0:
+        return 6, 0
+    finger_jacobian(tables, T, work, f, mounts.level[m], work.point, PLACE, J)
+    start = int(tables.first[f])
+    return 6 + int(tables.first[f + 1]) - start, start
 
 
 @inlined
@@ -322,7 +322,7 @@ def rotation_between(A: Float, B: Float, c: Float, out: Float) -> None:
                 k = i
         length = sqrt(max(0.5 * (1.0 + c[k, k]), 1e-12))
         for i in range(3):
-            out[i] = np.pi * (length if i == k else 0.25 * (c[i, k] + c[k, i]) / length)
+            out[i] = np.pi * (length if i == k else (c[i, k] + c[k, i]) / (4.0 * length))
 
 
 @kernel

@@ -35,6 +35,7 @@ from common.geometry.transforms import (
 from common.hand.model import HandModel
 from common.kernels import bound
 from common.messages import Detections, HandPose, WristDetections, restamped
+from common.messages.parts import MAX_NAME_CHARACTERS
 from master.estimator.epoch import (
     Epoch,
     Fitted,
@@ -227,9 +228,6 @@ def rotation_of(key: str, value: Quaternion | None) -> Float:
     return quaternion_to_matrix(np.array(value))
 
 
-_NAME = 64  # characters of a name in `Health`
-
-
 @dataclass(frozen=True, slots=True)
 class SolvedPose:
     """A pose, and when the last contributing frame was handed to its slave [ns]."""
@@ -256,7 +254,7 @@ class MarkerPipeline:
         volume: Volume | None = None,
         imu: ImuCalibration | None = None,
         side: "WristSide | None" = None,
-        slowest_hz: float = 60.0,
+        slowest_hz: float,
         counts: Counter[str] | None = None,
         stage: Stage = lambda name: nullcontext(),
         dropped_epochs: Callable[[], bool] | None = None,
@@ -470,7 +468,7 @@ class MarkerPipeline:
 
     def _count(self, event: str, markers: Bool) -> None:
         for m in np.flatnonzero(markers):
-            self.counts[f"{event}.{self.markers[m]}"[:_NAME]] += 1
+            self.counts[f"{event}.{self.markers[m]}"[:MAX_NAME_CHARACTERS]] += 1
 
     def _count_outliers(self, found: MarkerPositions, frames: FrameSet) -> None:
         """Count markers whose rays do not meet, and what is rejected of each camera."""
@@ -480,6 +478,6 @@ class MarkerPipeline:
         sees = np.isfinite(frames.uv[..., 0]) & np.isfinite(found.points_m[:, 0])
         mostly = found.rejected.sum(axis=1) > 0.5 * sees.sum(axis=1)
         for c in np.flatnonzero(found.rejected.any(axis=1)):
-            self.counts[f"rejected.{self._names[c]}"[:_NAME]] += int(found.rejected[c].sum())
+            self.counts[f"rejected.{self._names[c]}"[:MAX_NAME_CHARACTERS]] += int(found.rejected[c].sum())
             if mostly[c]:
-                self.counts[f"mostly_rejected.{self._names[c]}"[:_NAME]] += 1
+                self.counts[f"mostly_rejected.{self._names[c]}"[:MAX_NAME_CHARACTERS]] += 1

@@ -113,7 +113,6 @@ class Search:
     palm_camera: Float = array(4, 4)
     wrist_axes: Float = array(2, 3)
     twist: Float = array(5)
-    wrist_share: Float = array(1)  # as of `Settings`
     local_J: Float = array(3, 8)
     local_r: Float = array(3)
     local_w: Float = array(3)
@@ -407,17 +406,16 @@ def finger_rows(rig: Rig, epoch_prior: EpochPrior, f: int, at: Iterate, search: 
     for what in range(2):
         if (what == 0 and cycle_rows.lit[f] == 0.0) or (what == 1 and cycle_rows.shown[f] == 0.0):
             continue
-        rows, first = 2, 0
+        W, first = cycle_rows.laser_W[f], 2 * what
+        rows = 3 if what == 1 and cycle_rows.depth_w2[f] > 0.0 else 2
         if what == 0:
-            W = cycle_rows.laser_W[f]
             r[0] = surface.seen[0] + cycle_rows.lack[f, 0] - cycle_rows.laser[f, 0]
             r[1] = surface.seen[1] + cycle_rows.lack[f, 1] - cycle_rows.laser[f, 1]
         else:
-            W, first = cycle_rows.tip_W[f], 2
+            W = cycle_rows.tip_W[f]
             r[0] = surface.seen[2] - cycle_rows.tip[f, 0]
             r[1] = surface.seen[3] - cycle_rows.tip[f, 1]
-            if cycle_rows.depth_w2[f] > 0.0:
-                rows = 3
+            if rows == 3:
                 r[2] = surface.seen[4] + at.z[LED_SCALE] - cycle_rows.depth[f]
         for i in range(rows):
             for c in range(count):
@@ -437,7 +435,7 @@ def finger_rows(rig: Rig, epoch_prior: EpochPrior, f: int, at: Iterate, search: 
         for a in range(size):
             # What fingers measure of the bend counts for little: they err together, as the device is put on.
             of_wrist = a == count + 1 or a == count + 2
-            share = search.wrist_share[0] if of_wrist else 1.0
+            share = rig.settings.wrist_share if of_wrist else 1.0
             for i in range(rows):
                 at.gradient[column[a]] += share * J[i, a] * w[i]
             p0 = W[0, 0] * J[0, a] + W[0, 1] * J[1, a]
@@ -448,6 +446,6 @@ def finger_rows(rig: Rig, epoch_prior: EpochPrior, f: int, at: Iterate, search: 
                 if rows == 3:
                     total += p2 * J[2, b]
                 if b == count + 1 or b == count + 2 or of_wrist:
-                    total *= search.wrist_share[0]
+                    total *= rig.settings.wrist_share
                 at.normal[column[a], column[b]] += total
     return cost

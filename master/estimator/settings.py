@@ -308,6 +308,7 @@ class KernelSettings(NamedTuple):
     behind_chi2: float = 1e4  # half chi square of a marker behind a camera that sees it
     small_rad: float = 1e-4  # a shorter rotation vector counts as so long in the derivative
     lens_steps: int = 12  # of Newton, from a pixel to its ray
+    markers: int = 16  # what a kernel has room for, in such steps
     # Limits.
     tolerances: float = 3.0  # standard deviations beyond a limit, where there is no hand
     narrowest_rad: float = 1e-3  # limits that leave an angle no room

@@ -85,7 +85,7 @@ class Blend:
             led = np.bincount(PARTS, np.abs(self._offset)) > s.led_off_m
             leaps = ((sources != self._sources) | ~triangulated | led) & (off > s.led_leap_m)
             self._offset = np.where(leaps[PARTS], goes_on - solved, self._offset)
-            size_m = np.maximum(np.bincount(PARTS, np.abs(self._offset)), 1e-6)  # no division by 0
+            size_m = np.maximum(np.bincount(PARTS, np.abs(self._offset)), 1e-5)  # no division by 0
             left = 1.0 - min(self._blend_m_s * gap_s, s.led_step_m) / size_m
             self._offset = self._offset * np.maximum(left, exp(-gap_s / s.led_fades_s))[PARTS]
         self._sources, self._points_m = sources, points_m

@@ -31,6 +31,7 @@ from math import exp, sqrt
 import numpy as np
 
 from common.arrays import Bool, Code, Float, Int
+from common.hand.model import FINGERS
 from common.kernels import constant, inlined, inner
 from common.records import array, filled, record
 from master.estimator.kinematics import clamp, free_of
@@ -42,7 +43,7 @@ from master.fabrik.linear_algebra import cholesky, copy, inverse, substitute
 from master.fabrik.settings import NEVER_NS
 
 _NONE = constant(0)
-PALM_PART = 5  # behind the five fingers
+PALM_PART = len(FINGERS)  # behind the fingers
 
 
 class HandState:

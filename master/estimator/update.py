@@ -51,8 +51,9 @@ class Estimate(NamedTuple):
     @classmethod
     def empty(cls) -> "Estimate":
         """Scratch for one."""
-        shapes = (4, 4), 20, (26, 3), (26, 3, 3), (26, 3, 3), (5, 3, 3), 5
-        return cls(*map(np.empty, shapes), tracked=np.empty(26, np.bool_), source=np.empty(26, np.uint8))
+        joints_m = np.empty((26, 3)), np.empty((26, 3, 3)), np.empty((26, 3, 3))
+        fingers = np.empty((5, 3, 3)), np.empty(5), np.empty(26, np.bool_), np.empty(26, np.uint8)
+        return cls(np.empty((4, 4)), np.empty(20), *joints_m, *fingers)
 
 
 @inner

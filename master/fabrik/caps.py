@@ -156,9 +156,10 @@ class Views(NamedTuple):
     @classmethod
     def empty(cls, cameras: int) -> "Views":
         """Room for a number of cameras."""
-        by_camera = cameras, cameras, cameras
-        by_direction = (CAPS.tilted, 3), (CAPS.tilted, cameras, 2), (CAPS.tilted, cameras), (CAPS.tilted, 3)
-        return cls(*(np.empty(shape) for shape in (*by_camera, *by_direction, 3, 3, (3, 2), (3, 3), (3, 3))))
+        T, by_camera = CAPS.tilted, [np.empty(cameras) for _ in range(3)]
+        by_direction = np.empty((T, 3)), np.empty((T, cameras, 2)), np.empty((T, cameras)), np.empty((T, 3))
+        scratch = np.empty(3), np.empty(3), np.empty((3, 2)), np.empty((3, 3)), np.empty((3, 3))
+        return cls(*by_camera, *by_direction, *scratch)
 
 
 @kernel
@@ -219,7 +220,7 @@ def tilted(row: int, R: Float, tilt_rad2: Float, rotation_rad2: float, out: Floa
 
 @inner
 def any_direction(cameras: CameraArrays, point: Float, out: Float) -> None:
-    """Write directions (CAPS.any_tilted, 3) in which a cap at a point may point, hand unknown.
+    """Write where a cap at a point may point (CAPS.any_tilted, 3), hand unknown.
 
     Towards the middle of the cameras, and four bent away from it as far as the cap is still seen.
     """

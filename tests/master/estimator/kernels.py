@@ -124,12 +124,12 @@ def look_at(
     angles: Float,
     f: int,
     boxed_work: Any,
-) -> int:
+) -> None:
     """`master.estimator.finger_surface.look` at a wrist that is bent by (2,) and hinges rolled by (5,)."""
     T, axes, hand, device = np.zeros((4, 4)), np.zeros((2, 3)), boxed_hand[0], boxed_device[0]
     twist_hand(hand, twist)
     flexed_palm(device.palm, wrist_angles[0], wrist_angles[1], T, axes)
-    return look(hand, device, T, axes, angles, f, MOVES, boxed_work[0])
+    look(hand, device, T, axes, angles, f, MOVES, boxed_work[0])
 
 
 @kernel

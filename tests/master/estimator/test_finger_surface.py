@@ -173,7 +173,6 @@ def test_a_finger_that_ends_before_the_plane_is_prolonged(wrist_case: WristCase)
     """So that a search finds its way back: the laser misses it, the ridge has a point and derivatives."""
     bend = np.radians([-45.0, 0.0])
     seen = wrist_case.looks(bent(-10.0, 0.0), bend)
-    assert (seen.stretch[1:] >= 16).all()
     assert (seen.length_px[1:] == 0.0).all()
     assert np.isfinite(seen.predicted_laser).all()
     assert np.isfinite(seen.by).all()

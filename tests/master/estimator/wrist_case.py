@@ -36,7 +36,6 @@ class Seen:
         predicted_laser: (5, 2) by the ridge.
         tip: (5, 2) fingertips, and `depth_m` (5,) how far they are along the camera's axis.
         by: (5, 5, 7) derivatives of ridge, tip and logarithm of its distance (`master.estimator.finger_surface.look`).
-        stretch: (5,) of the ridge that is lit.
     """
 
     laser: Float
@@ -45,7 +44,6 @@ class Seen:
     tip: Float
     depth_m: Float
     by: Float
-    stretch: Float
 
 
 class WristCase:
@@ -69,15 +67,15 @@ class WristCase:
         """What is seen of angles (5, 4) [rad], at a bend (2,) and with hinges rolled by (5,) [rad]."""
         work, flat = record(Surface), np.ascontiguousarray(angles).reshape(20)
         laser, predicted_laser, tip = (np.full((5, 2), np.nan) for _ in range(3))
-        length, depth, by, stretch = np.zeros(5), np.zeros(5), np.zeros((5, 5, 7)), np.zeros(5)
+        length, depth, by = np.zeros(5), np.zeros(5), np.zeros((5, 5, 7))
         for f in range(5):
             boxes = boxed(self.tables), boxed(self.device)
-            stretch[f] = look_at(*boxes, np.asarray(wrist_angles), np.asarray(twist), flat, f, boxed(work))
+            look_at(*boxes, np.asarray(wrist_angles), np.asarray(twist), flat, f, boxed(work))
             predicted_laser[f], tip[f], depth[f], by[f] = work.seen[:2], work.seen[2:4], work.tip[2], work.J
             length[f] = laser_centroid_at(boxed(self.device), f, boxed(work))
             if length[f] > 0.0:
                 laser[f] = work.laser_centroid[:2] / work.laser_centroid[2]
-        return Seen(laser, length, predicted_laser, tip, depth, by, stretch)
+        return Seen(laser, length, predicted_laser, tip, depth, by)
 
     def message(
         self,
