@@ -356,7 +356,9 @@ def _settings_in(node: ast.AST, *, whole: bool, inside: bool) -> Iterator[str]:
     layout = isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple)
     layout = layout and all(name.isupper() for name in re.findall(r"\w+", ast.unparse(node.targets[0])))
     for key, value in ast.iter_fields(node):
-        bound = key in {"value", "defaults", "kw_defaults"} and not isinstance(node, ast.AugAssign)
+        bound = key in {"value", "defaults", "kw_defaults"} and not isinstance(
+            node, ast.AugAssign | ast.Return
+        )
         bound = (bound or (whole and isinstance(node, ast.Tuple | ast.UnaryOp))) and not layout
         index = key == "slice" or (key == "args" and isinstance(node, ast.Call) and called(node) in SHAPES)
         within = inside and isinstance(

@@ -11,8 +11,7 @@ from common.hand.profiles import mirrored_profile
 from common.messages import Source, WristDetections
 from common.sim.wrist.scene import WristScene, WristTruth
 from master.outputs.poses import Poses
-from master.rig.setup import RigSetup, load_setup
-from master.rig.wrist import WristSetup
+from master.rig.setup import RigSetup, WristSetup, load_setup
 from tests.results import pose_of
 
 CYCLE_NS = 33_333_333

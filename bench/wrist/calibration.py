@@ -29,7 +29,7 @@ from master.calibrate.wrist.device import LitView
 from master.calibrate.wrist.laser_plane import PlaneFit, fit_plane, lines_of
 from master.calibrate.wrist.subject import Subject, calibrate_subject
 from master.estimator.wrist_pipeline import WristPipeline
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 
 LASER_PX, TIP_PX = 0.4, 3.0
 

@@ -22,7 +22,7 @@ from common.hand.model import CHAINS
 from common.messages import WristDetections
 from common.sim.wrist.scene import AMBIENTS, WristScene
 from master.estimator.wrist_pipeline import WristPipeline
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 from slave.wrist.detector import find
 from slave.wrist.led_image import WristView
 from slave.wrist.strobe import StrobeCycle

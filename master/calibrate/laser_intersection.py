@@ -24,7 +24,7 @@ from common.geometry.tapered_capsules import Capsules, first_hits, terms
 from common.geometry.transforms import transform
 from common.hand.skin import ROOT, PalmarSurface
 from master.estimator.sensors import PlaneAxes
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -40,7 +40,7 @@ from master.estimator.solve import Blank
 from master.estimator.state import stationary_of, unknown_hand
 from master.estimator.update import Estimate, fit_epoch, predict_epoch, take_over_epoch
 from master.estimator.wrist_update import prepare_epoch
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 
 
 @dataclass(frozen=True, slots=True, eq=False)

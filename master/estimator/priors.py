@@ -37,7 +37,7 @@ from master.estimator.parameters import HandParameters, HandTables
 from master.estimator.sensors import Device, flexed_palm
 from master.estimator.settings import DEFAULT, KERNEL, LAWS, Settings
 from master.fabrik.linear_algebra import as_vector
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 
 Row = tuple[dict[int, float], float, float]
 

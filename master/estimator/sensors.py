@@ -25,7 +25,7 @@ from common.hand.skin import PLACES, SPREAD, PalmarSurface
 from common.kernels import inlined, inner, kernel
 from common.records import array, filled, record
 from master.estimator.settings import KERNEL
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 
 
 class CameraArrays(NamedTuple):

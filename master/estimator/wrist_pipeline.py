@@ -55,7 +55,7 @@ from master.estimator.priors import WristModel, loosened
 from master.estimator.sensors import HEADING, TILT, WRIST_ANGLES, WristRows
 from master.estimator.settings import DEFAULT, Settings
 from master.fabrik.settings import NEVER_NS
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 
 ANYWHERE_RAD = pi / sqrt(3.0)  # standard deviation of a uniform circle
 _EYE = np.eye(3)

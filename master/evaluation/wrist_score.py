@@ -18,7 +18,7 @@ from common.recording.frame_recording import FrameRecording, Illumination
 from common.recording.recorded_files import TRUTH, has_truth, read_truth
 from master.evaluation.score import put
 from master.outputs.poses import Poses
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 
 GROUPS = ("palm", *FINGERS, "thenar")  # rows of the truth's laser line
 _OF_FINGERS = slice(1, 1 + FINGER_COUNT)

@@ -156,7 +156,7 @@ class Views(NamedTuple):
     @classmethod
     def empty(cls, cameras: int) -> "Views":
         """Room for a number of cameras."""
-        T, by_camera = CAPS.tilted, [np.empty(cameras) for _ in range(3)]
+        T, by_camera = CAPS.tilted, (np.empty(cameras), np.empty(cameras), np.empty(cameras))
         by_direction = np.empty((T, 3)), np.empty((T, cameras, 2)), np.empty((T, cameras)), np.empty((T, 3))
         scratch = np.empty(3), np.empty(3), np.empty((3, 2)), np.empty((3, 3)), np.empty((3, 3))
         return cls(*by_camera, *by_direction, *scratch)

@@ -28,7 +28,7 @@ from common.hand.model import FINGER_JOINTS, FINGERS, WRIST, HandModel
 from common.hand.wrist import forearm_palm
 from common.messages import ObjectPose, Source
 from master.outputs.poses import Poses, PosesTruth, distance_m, mean_known
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 
 Rgb = tuple[int, int, int]
 

@@ -40,8 +40,7 @@ from master.outputs.drawing import (
 )
 from master.outputs.poses import Poses, PosesTruth
 from master.outputs.result_files import Contacts, ObjectPoses, nearest_rows
-from master.rig.setup import RigSetup
-from master.rig.wrist import WristSetup
+from master.rig.setup import RigSetup, WristSetup
 
 _BOX = (0.012, 0.03, 0.225, 0.30)  # left, bottom, width, height of the figure: an image of 4 to 3
 _FOREARM_M = 0.055  # of it

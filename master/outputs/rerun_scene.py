@@ -79,8 +79,7 @@ from master.outputs.rerun_blueprint import (
     seen,
 )
 from master.outputs.rerun_results import GesturesLayer, ObjectsLayer
-from master.rig.setup import RigSetup
-from master.rig.wrist import WristSetup
+from master.rig.setup import RigSetup, WristSetup
 
 _FAN_LINE_M = 0.0003
 _WRIST_ANGLES = ("flexion", "deviation")

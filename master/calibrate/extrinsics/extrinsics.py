@@ -44,8 +44,7 @@ from master.calibrate.wrist.device import device_of, writes_rig
 from master.estimator.sensors import in_image, laser_points
 from master.replay.recorded import recorded_cycles
 from master.rig.pipeline import build_pipeline
-from master.rig.setup import RigSetup, load_hand
-from master.rig.wrist import WristSetup
+from master.rig.setup import RigSetup, WristSetup, load_hand
 from master.run.app import StageTimes
 
 _SHIFT_M, _ROTATION_RAD, _CLOCK_S = 4e-3, np.radians(4.0), 8e-3  # standard deviations, at most

@@ -27,7 +27,7 @@ from common.hand.skin import PalmarSurface
 from common.messages import HandPose, ImuSample
 from master.calibrate.laser_intersection import LaserIntersection
 from master.estimator.sensors import PlaneAxes
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 
 GAP_S = 0.06  # between samples of an IMU
 _EYE = np.eye(3)

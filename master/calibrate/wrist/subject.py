@@ -37,7 +37,7 @@ from master.calibrate.wrist.subject_fit import (
 )
 from master.calibrate.wrist.subject_model import MCP, SubjectModel, Unknown, fitted_profile
 from master.replay.recorded import recorded_cycles
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 
 TOOL = "calibrate wrist subject"
 _NAMES = FINGERS[1:]

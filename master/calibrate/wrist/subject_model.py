@@ -20,7 +20,7 @@ from common.hand.skin import PalmarSurface
 from master.calibrate.laser_intersection import LaserIntersection
 from master.estimator.priors import DIP, FlexionSynergy
 from master.estimator.sensors import PlaneAxes
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 
 FINGERS = slice(1, 5)
 UNKNOWN, LOCAL = 26, 3

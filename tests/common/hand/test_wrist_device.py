@@ -12,7 +12,7 @@ from common.calibration.rig import Laser, LaserPlane
 from common.errors import CalibrationError
 from common.hand.model import HandModel
 from common.hand.wrist import WristDevice
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 from slave.wrist.led_image import WristView
 
 ROOT = Path(__file__).parents[3] / "calib_json"

@@ -11,7 +11,7 @@ from common.hand.model import CHAINS
 from common.hand.wrist import STRAIGHT
 from master.calibrate.laser_intersection import LaserIntersection
 from master.estimator.sensors import PlaneAxes
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 from tests.master.estimator.wrist_case import NO_TWIST, PIP, WristCase, bent, natural
 from tests.wrist_run import mirrored_setup
 

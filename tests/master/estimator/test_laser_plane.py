@@ -7,7 +7,7 @@ import pytest
 
 from common.geometry.transforms import axis_rotation
 from master.estimator.sensors import PlaneAxes, laser_points
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 from tests.wrist_run import wrist_setup
 
 

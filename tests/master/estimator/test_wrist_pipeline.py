@@ -19,8 +19,7 @@ from common.messages import HandPose, SolverMode, Source, WristDetections
 from master.estimator.sensors import LED_SCALE
 from master.estimator.settings import DEFAULT
 from master.estimator.wrist_pipeline import WristPipeline
-from master.rig.setup import RigSetup
-from master.rig.wrist import WristSetup
+from master.rig.setup import RigSetup, WristSetup
 from tests.master.estimator.wrist_case import (
     CYCLE_NS,
     DIP,

@@ -16,7 +16,7 @@ from master.estimator.parameters import HandParameters, HandTables
 from master.estimator.priors import WristModel, loosened
 from master.estimator.sensors import Device
 from master.estimator.wrist_pipeline import WristPipeline
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 from tests.master.estimator.kernels import laser_centroid_at, look_at
 from tests.wrist_run import wrist_setup
 

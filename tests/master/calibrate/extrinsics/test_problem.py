@@ -12,7 +12,7 @@ from master.calibrate.extrinsics.extrinsics import _cycles
 from master.calibrate.extrinsics.problem import Hands, Problem, bends_by_rotation, wrist_rotation_angles
 from master.calibrate.extrinsics.tracks import HandTrack, ImuTrack, LinesOfSight
 from master.calibrate.extrinsics.unknown import UNKNOWN, Unknown, prior_sigma
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 from tests.master.calibrate.extrinsics.moved import CAMERA_LATE_NS, IMU_LATE_NS, ZERO_NS, moved
 
 EYE = np.eye(3)

@@ -19,7 +19,7 @@ from common.sim.wrist.board import WristBoardScene, record_wrist_board
 from common.sim.wrist.scene import WristScene
 from master.calibrate.cameras.boards import Checkerboard
 from master.calibrate.wrist.palm import BoardOffset
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 from tests.cli import calibrate
 from tests.conftest import ROOT
 from tests.master.calibrate.wrist.devices import CAMERA, RIG, angle_deg, plane_of, scene_of

@@ -12,7 +12,7 @@ from common.hand.model import HandModel
 from master.calibrate.laser_intersection import LaserIntersection
 from master.estimator.priors import FlexionSynergy
 from master.estimator.sensors import PlaneAxes
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 from tests.wrist_run import mirrored_setup, wrist_setup
 
 

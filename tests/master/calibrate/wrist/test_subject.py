@@ -24,7 +24,7 @@ from master.calibrate.wrist import subject
 from master.calibrate.wrist.subject import Subject, _check, calibrate_subject
 from master.calibrate.wrist.subject_fit import FLAT, fists_of, guided
 from master.calibrate.wrist.subject_model import MCP, UNKNOWN, SubjectModel, Unknown, fitted_profile
-from master.rig.wrist import WristSetup
+from master.rig.setup import WristSetup
 from tests.cli import calibrate
 
 ANGLES = np.radians(
