@@ -18,6 +18,7 @@ import msgspec
 import numpy as np
 from scipy.optimize import least_squares  # pyright: ignore[reportUnknownVariableType]
 
+from bench.hands.chains import Fabrik
 from common.arrays import Float
 from common.calibration import Couplings, HandProfile, Limits
 from common.geometry.camera_model import CameraModel
@@ -27,7 +28,6 @@ from common.hand.profiles import ABDUCTION, FLEXION, generated_profile, preset_l
 from master.estimator.epoch import Epoch, Fitted, OrientationMeasurement
 from master.estimator.estimator import Estimator
 from master.estimator.settings import DEFAULT, Settings
-from master.fabrik.fabrik import Fabrik
 from master.fabrik.linear_algebra import Vector, as_vector
 from master.fabrik.solver import Finger
 

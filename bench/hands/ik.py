@@ -11,10 +11,10 @@ from functools import partial
 import numpy as np
 
 from bench.hands import draws
+from bench.hands.chains import Fabrik
 from bench.hands.draws import MARKERS, Angles, Draw, Fingers, Score
 from bench.report import Row, rms
 from common.hand.model import HandModel
-from master.fabrik.fabrik import Fabrik
 from master.fabrik.linear_algebra import Vector
 from master.fabrik.solver import Finger
 

@@ -45,21 +45,15 @@ class Prior:
     light2: Float = array(1)
     base_rad: Float = array(5, 4)  # natural angles by the PIP: base_rad + per_pip PIP
     per_pip: Float = array(5, 4)
-    abduction: Float = array(
-        5
-    )  # standard deviations [rad] of abduction, and `flexion` of flexion, about them
+    abduction: Float = array(5)  # standard deviations [rad] about them, as `flexion`
     flexion: Float = array(5)
-    coupled_share: Float = array(
-        1
-    )  # by how much of the PIP more this hand bends in its MCP (`wrist_update`),
+    coupled_share: Float = array(1)  # of the PIP by which this MCP bends more (`wrist_update`),
     coupled_spread: Float = array(1)  # and within how much of it
     last: Float = array(5)  # PIPs expected [rad],
     process_noise: Float = array(5)  # how far from there they may be,
     had_previous: Float = array(5)  # and whether they are expected anywhere
     near_rad: Float = array(5)  # how far from there a finger that is well known is searched; 0: everywhere
-    natural_only: Float = array(
-        1
-    )  # 1 where fingers are taken to bend naturally, whatever is seen (level "fk")
+    natural_only: Float = array(1)  # 1: fingers are taken to bend naturally (level "fk")
     law: Float = array(5)  # PIPs by another law [rad]; NaN: none
     frame: Float = array(4)  # least and most x and y of a fingertip that is clearly in the image
 

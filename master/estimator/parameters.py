@@ -142,9 +142,7 @@ class HandTables:
     root_m: Float = array(5, 3)  # first joint of each chain, palm frame [m]
     bone_m: Float = array(5, 3, 3)  # bones in the frames of their joints [m]
     abduction_axis: Float = array(5, 3)  # palm frame
-    first: Int = array(
-        6, kind="i8"
-    )  # columns of the free angles of finger f are first[f] ... first[f + 1] - 1
+    first: Int = array(6, kind="i8")  # finger f has the free angles first[f] ... first[f + 1] - 1
     complete: Float = array(20, 4)  # all angles by the free ones of their finger, abductions not narrowed
     narrows: Bool = array(5, kind="u1")  # whether flexion narrows the finger's abduction
     most: Float = array(5)  # [rad] highest flexion
@@ -159,14 +157,10 @@ class HandTables:
     limits: Float = array(5, 4, 2)  # [rad] low and high of all angles, abductions not narrowed
     finger: Int = array(26, kind="i8")  # chain of each joint, -1: fixed to the palm
     level: Int = array(26, kind="i8")  # its place in the chain
-    middle: Int = array(
-        26, kind="i8"
-    )  # PIP of its finger, a metacarpal's too; thumb, palm, wrist: the joint itself
+    middle: Int = array(26, kind="i8")  # PIP of its finger; thumb, palm, wrist: the joint itself
     rest_m: Float = array(26, 3)  # [m] place, palm frame, and `rest_R` rotation of those fixed to the palm
     rest_R: Float = array(26, 3, 3)
-    twist: Float = array(
-        5
-    )  # [rad] roll of each finger's hinges about its first bone, in `swing` (`twist_hand`)
+    twist: Float = array(5)  # [rad] roll of the hinges about the first bone, in `swing` (`twist_hand`)
     twist_axis: Float = array(5, 3)  # that bone, in the frame of the abduction
     untwisted: Float = array(3, 5, 3, 3)  # `swing` of the abductions with hinges as the profile has them
     product: Float = array(3, 3)  # scratch

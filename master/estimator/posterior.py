@@ -318,9 +318,7 @@ class Task:
     palm: Float = array(4, 4)  # of another hand of the epoch, and `angles` (20,) [rad]
     angles: Float = array(20)
     may_leave: Bool = array(1, kind="u1")  # whether there is another, and it may take the place of the state
-    coarse: Bool = array(
-        1, kind="u1"
-    )  # whether a search ends early, in place, under the widest hypothesis alone
+    coarse: Bool = array(1, kind="u1")  # a search ends early, in place, under the widest hypothesis
     natural_weight: Float = array(1)  # probability of a natural hand a moment ago
     counts: Float = array(1)  # what that counts, 0 ... 1
     second_order: Bool = array(1, kind="u1")  # whether covariance is wanted to second order

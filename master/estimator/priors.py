@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.arrays import Bool, Float, Int
+from common.arrays import Bool, Float
 from common.calibration.rig import FingerLine
 from common.errors import CalibrationError, FitError
 from common.hand.model import FINGERS, HandModel
@@ -49,14 +49,6 @@ class PosturePrior(NamedTuple):
     pull: Float  # (H, n)
     constant: Float  # (H,) so that the cost is that of the squares
     log_density: Float  # (H,) at cost 0, but for what the hypotheses have in common
-
-    def without(self, columns: Int, mean: float, sigma: float) -> "PosturePrior":
-        """Return the prior less these rows on single angles in the first hypothesis."""
-        normal, pull, constant = self.normal.copy(), self.pull.copy(), self.constant.copy()
-        normal[0, columns, columns] -= 1.0 / sigma**2
-        pull[0, columns] -= mean / sigma**2
-        constant[0] -= 0.5 * len(columns) * (mean / sigma) ** 2
-        return PosturePrior(normal, pull, constant, self.log_density)
 
     def natural_component(self) -> "PosturePrior":
         """Those of the first hypothesis alone."""

@@ -75,9 +75,7 @@ class EpochPrior:
     z_info: Float = array("K", "K")  # their information
     orientation_info: Float = array(3, 3)  # [1/rad^2] information of the measured orientation, rig axes
     oriented: Float = array(1)  # whether there is any
-    forearm: Float = array(
-        4, 4
-    )  # the palm by these in its first rows and columns; `on_forearm`: a straight wrist's
+    forearm: Float = array(4, 4)  # rotation of the palm by these; `on_forearm`: of a straight wrist
     on_forearm: Float = array(1)
     axes: Float = array(3, 3)  # rows, rig axes, about which tilt and heading turn a forearm
     place: Float = array(3)  # [m] where the palm is

@@ -174,10 +174,6 @@ class PlaneAxes:
         """Coordinates (..., 2) [m] of points (..., 3)."""
         return (points_m - self.origin_m) @ self.axes.T
 
-    def space(self, flat_m: Float) -> Float:
-        """Points (..., 3) [m], camera frame, of coordinates (..., 2)."""
-        return self.origin_m + flat_m @ self.axes
-
     def flat_cov(self, cov_m2: Float) -> Float:
         """Covariances (..., 2, 2) of covariances (..., 3, 3)."""
         return self.axes @ cov_m2 @ self.axes.T

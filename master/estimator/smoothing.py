@@ -130,9 +130,7 @@ class Smoothing:
     offset: Float = array(26)  # [m] what was shown less what was solved, when each part was last seen again
     since_ns: Int = array(6, kind="i8")  # when that was
     until_ns: Int = array(1, kind="i8")  # when nothing is left of any
-    count: Int = array(
-        2, kind="i8"
-    )  # with `dt_s`, `past`: the measured noise (`master.fabrik.one_euro.measure`)
+    count: Int = array(2, kind="i8")  # with `dt_s`, `past`: noise (`master.fabrik.one_euro.measure`)
     dt_s: Float = array(1)
     past: Float = array(3, 26)
     x: Float = array(26)  # with `speed`, `seen_ns`: the filter (`master.fabrik.one_euro.filter_step`)

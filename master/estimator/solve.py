@@ -314,9 +314,7 @@ class Posterior:
     palm: Float = array(4, 4)
     x: Float = array("n")  # free angles
     z: Float = array("K")  # extras
-    cov: Float = array(
-        "N", "N"
-    )  # turn [rad], shift [m], rig axes, free angles [rad], extras, by this epoch alone
+    cov: Float = array("N", "N")  # turn, shift, rig axes, free angles, extras, by this epoch alone
     marker_chi2: Float = array("M")
     steps: Float = array(1)  # of the search
     natural_weight: Float = array(1)  # probability that the hand follows the posture prior

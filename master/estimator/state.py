@@ -64,18 +64,14 @@ class HandState:
     z_ns: Int = array(1, kind="i8")  # when they were stepped last
     stationary: Float = array("K")  # variances to grow to
     wrist_mean_rad: Float = array(2)  # [rad] the bend of the wrist that is kept
-    solver_mode: Code = array(
-        5, kind="u1"
-    )  # `SolverMode` codes of a finger's last solution by the device; 0: markers since
+    solver_mode: Code = array(5, kind="u1")  # `SolverMode` last used by the device; 0: markers since
     searched: Int = array(5, kind="i8")  # strobe cycles since the whole cost map of a finger was searched
     vague: Bool = array(5, kind="u1")  # whether that was not well enough to be tracked
     coupling: Float = array(3)  # sums of what was learnt of MCP and PIP (`master.estimator.wrist_update`)
     natural_weight: Float = array(1)  # probability that it follows the posture prior
     speed: Float = array(1)  # [m/s] of the palm
     lost_s: Float = array(1)  # how long nothing measures where it is
-    hidden_ns: Int = array(
-        5, kind="i8"
-    )  # when a finger hidden at the last epoch was seen last; NEVER_NS: seen there
+    hidden_ns: Int = array(5, kind="i8")  # when a hidden finger was seen last; NEVER_NS: it is seen
     then: Float = array(5, 20)  # the angles of the whole hand at that time
     then_rates: Float = array(5, 20)  # [rad/s]
     then_alike: Float = array(5)  # how neighbours correlated then

@@ -144,14 +144,10 @@ class FabrikSettings(NamedTuple):
 
     tolerance_m: float = 1e-5
     target_m: float = 1e-4  # the same, of a hand's fingers
-    iterations: int = 100
     finger_iterations: int = 10  # from the closed form; what that cannot reach iterations improve little
-    restarts: int = 3
     stall: float = 0.995  # of the last residual, above which an iteration gained nothing
     stalls: int = 6
     halvings: int = 14  # of the bend of a restart
-    search_step: float = 0.25  # of a joint's range, for the least distance that limits allow
-    search_least: float = 1e-4
     # Of least squares: steps from each start and from the best of their ends.
     first_steps: int = 8
     most_steps: int = 60

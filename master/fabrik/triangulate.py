@@ -227,10 +227,8 @@ class _Scratch(NamedTuple):
     off: Float  # (3,) [m] the point, were the finger tilted
     aim: Float  # (3,) another direction of the finger
     bias: Float  # (2, 2) [px] of the centroids
-    shown: (
-        Float  # (2,) area [m^2] that the whole cap shows each camera, and the most of all directions (1, 2)
-    )
-    whole: Float
+    shown: Float  # (2,) area [m^2] that the whole cap shows each camera,
+    whole: Float  # and the most of all directions (1, 2)
     tilted: Float  # (2, 3) standard deviations of the direction
     by: Float  # (3, 3) derivatives
 

@@ -8,7 +8,8 @@ import pytest
 
 from common.calibration.rig import FingerLine
 from common.hand.model import FINGERS
-from master.estimator.priors import ROOT_MM, CubicLaw, cubic_pip, on_line, simulated_lines
+from master.estimator.priors import CubicLaw, cubic_pip, on_line, simulated_lines
+from master.estimator.settings import LAWS
 from tests.master.estimator.wrist_case import WristCase, natural
 
 
@@ -20,7 +21,7 @@ def wrist_case(root: Path) -> WristCase:
 def test_the_printed_cubic() -> None:
     # Digits, UIST 2012: 119.75 degrees at 0; its root is at 102.06 mm.
     np.testing.assert_allclose(np.degrees(cubic_pip(np.array([0.0, 0.05]))), [119.75, 26.25], atol=0.01)
-    assert np.degrees(cubic_pip(np.array([1e-3 * ROOT_MM]))) == pytest.approx(0.0, abs=0.05)
+    assert np.degrees(cubic_pip(np.array([1e-3 * LAWS.cubic_mm]))) == pytest.approx(0.0, abs=0.05)
 
 
 def test_the_cubic_is_clamped_and_falls() -> None:

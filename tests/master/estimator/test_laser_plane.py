@@ -20,15 +20,12 @@ def setup(root: Path) -> WristSetup:
 
 def test_points_on_the_plane_come_back(setup: WristSetup) -> None:
     axes = PlaneAxes.of(setup)
-    points = axes.space(np.array([[-0.04, 0.08], [0.0, 0.15], [0.03, 0.19], [0.05, 0.07], [-0.02, 0.1]]))
+    flat = np.array([[-0.04, 0.08], [0.0, 0.15], [0.03, 0.19], [0.05, 0.07], [-0.02, 0.1]])
+    points = axes.origin_m + flat @ axes.axes
     np.testing.assert_allclose(points @ setup.normal, setup.offset_m, atol=1e-15)
     found = laser_points(setup, setup.optics.project(points), np.full(5, 0.2))
     np.testing.assert_allclose(found.point_m, points, atol=1e-9)
-    np.testing.assert_allclose(
-        axes.flat(found.point_m),
-        [[-0.04, 0.08], [0.0, 0.15], [0.03, 0.19], [0.05, 0.07], [-0.02, 0.1]],
-        atol=1e-9,
-    )
+    np.testing.assert_allclose(axes.flat(found.point_m), flat, atol=1e-9)
 
 
 def test_axes_point_to_image_right_and_away(setup: WristSetup) -> None:
@@ -40,7 +37,8 @@ def test_axes_point_to_image_right_and_away(setup: WristSetup) -> None:
 
 def test_the_covariance_is_that_of_noisy_pixels(setup: WristSetup) -> None:
     rng = np.random.default_rng(4)
-    uv = setup.optics.project(PlaneAxes.of(setup).space(np.array([[0.01, 0.14]])))
+    axes = PlaneAxes.of(setup)
+    uv = setup.optics.project(axes.origin_m + np.array([[0.01, 0.14]]) @ axes.axes)
     noisy = uv + 0.4 * rng.normal(size=(4000, 2))
     scattered = laser_points(setup, noisy, np.full(4000, 0.4)).point_m
     claimed = laser_points(setup, uv, np.array([0.4])).cov_m2[0]

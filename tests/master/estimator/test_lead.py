@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
+from master.estimator.settings import DEFAULT
 from master.estimator.smoothing import Blend
 
 STEP_S, SPEED = 1 / 60, 0.12
@@ -14,7 +15,7 @@ class Shown:
     """A hand of which the place is shown; its markers go along."""
 
     def __init__(self) -> None:
-        self.blend, self.values, self.gap_s = Blend(SPEED, ON_PALM), np.zeros(26), 0.0
+        self.blend, self.values, self.gap_s = Blend(SPEED, ON_PALM, DEFAULT), np.zeros(26), 0.0
 
     def push(self, place: float, rests: int, marker: float = np.nan) -> float:
         """What is shown of a place that was solved, by a marker on the back that is seen there."""

@@ -19,9 +19,11 @@ from common.geometry.transforms import (
     quaternion_to_matrix,
 )
 from master.estimator.epoch import OrientationMeasurement, SolvedHand
-from master.estimator.pipeline import REACH_NS, OrientationTrack, slerp
+from master.estimator.pipeline import OrientationTrack, slerp
+from master.estimator.settings import DEFAULT
 from tests.hand_helpers import any_rotation
 
+REACH_NS = round(1e9 * DEFAULT.sample_reach_s)
 MS = 1_000_000
 MOUNTED, WORLD = (0.5, 0.5, -0.5, 0.5), (0.8, 0.6, 0.0, 0.0)
 UP = quaternion_to_matrix(np.array(WORLD))[:, 2]

@@ -64,11 +64,10 @@ class Whole:
             record(EpochPrior, n=n, K=K),
             record(Search, n=n, K=K, N=6 + n + K, M=16),
         )
-        self.search.wrist_share[0] = 1.0
         self.observed = Observations.empty(2, 6)
         self.rig = Model(
             boxed(HandTables.of(model, self.parameters)),
-            boxed(DEFAULT.record()),
+            boxed(DEFAULT.changed("wrist_share", 1.0).record()),  # with less, the gradient is not the cost's
             Mounts.of(model, MARKERS),
             CameraArrays.of(CAMERAS),
             boxed(record(Device) if device is None else device),

@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from bench.hands.chains import Fabrik
 from common.hand.model import FINGERS, HandModel
 from common.hand.profiles import generated_profile
-from master.fabrik.fabrik import Chain, Fabrik, Link
+from master.fabrik.fabrik import Chain, Link
 from master.fabrik.joints import Hinge, Rotor
 from master.fabrik.linear_algebra import IDENTITY, as_vector
 from master.fabrik.solver import Finger

@@ -10,10 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bench.hands.chains import ChainResult, Fabrik, Reach, least_root_to_end
 from common.arrays import Float
 from common.hand.model import FINGERS, HandModel
 from common.hand.profiles import generated_profile, preset_couplings, preset_limits
-from master.fabrik.fabrik import Chain, ChainResult, Coupling, Fabrik, Link, Reach, least_root_to_end
+from master.fabrik.fabrik import Chain, Coupling, Link
 from master.fabrik.joints import Hinge, Rotor, abduction_span, rotation
 from master.fabrik.linear_algebra import (
     IDENTITY,
