@@ -291,8 +291,7 @@ DEFAULT = Settings()
 class KernelSettings(NamedTuple):
     """Numbers that kernels have compiled in, and the laws of fingers.
 
-    numba sees no change of another file: after one of these, delete the `__pycache__` of this room and of
-    `master.fabrik`.
+    numba sees no change of another file: after one of these, `make install` compiles anew.
     """
 
     # Covariance.

@@ -1,7 +1,6 @@
 """All tuning numbers of the card's line, with unit and reason.
 
-Kernels have them compiled in, and numba sees no change of another file: after one, delete the `__pycache__` of
-this room and of `master.estimator`.
+Kernels have them compiled in, and numba sees no change of another file: after one, `make install` compiles anew.
 """
 
 from math import pi, radians
