@@ -52,7 +52,7 @@ class Prior:
     last: Float = array(5)  # PIPs expected [rad],
     process_noise: Float = array(5)  # how far from there they may be,
     had_previous: Float = array(5)  # and whether they are expected anywhere
-    near_rad: Float = array(5)  # how far from there a finger that is well known is searched; 0: everywhere
+    window_rad: Float = array(5)  # how far from there a finger that is well known is searched; 0: everywhere
     natural_only: Float = array(1)  # 1: fingers are taken to bend naturally (level "fk")
     law: Float = array(5)  # PIPs by another law [rad]; NaN: none
     frame: Float = array(4)  # least and most x and y of a fingertip that is clearly in the image
@@ -70,7 +70,7 @@ class Scan:
     hand: Float = array(5, HANDS)  # logarithm of the evidence of each hand
     share: Float = array(HANDS)  # probabilities of the hands
     p: Float = array(_PLACES)  # density of one finger
-    near: Float = array(_PLACES)  # that by which its place is chosen
+    weighted: Float = array(_PLACES)  # that by which its place is chosen
     log_p: Float = array(5, HANDS, _PLACES)  # logarithm of the density of each finger, fine, by hand
     out: Float = array(5, 5)  # angles and twist chosen
     mode: Float = array(5, 5)  # of the most likely pose of that part
@@ -188,10 +188,10 @@ def scan_finger(rig: Rig, lines: CycleRows, prior: Prior, f: int, scan: Scan) ->
     low, high = rig.hand.limits[f, 2, 0], rig.hand.limits[f, 2, 1]
     scan.chi2[f] = inf
     first, last = 0, NODES - 1
-    if prior.near_rad[f] > 0.0:
+    if prior.window_rad[f] > 0.0:
         step = (high - low) / (NODES - 1)
-        first = min(max(int((prior.last[f] - prior.near_rad[f] - low) / step), 0), NODES - 3)
-        last = max(int((prior.last[f] + prior.near_rad[f] - low) / step) + 1, first + 2)
+        first = min(max(int((prior.last[f] - prior.window_rad[f] - low) / step), 0), NODES - 3)
+        last = max(int((prior.last[f] + prior.window_rad[f] - low) / step) + 1, first + 2)
         last = min(last, NODES - 1)
     scan.first[f], scan.last[f] = first, last
     for node in range(first, last + 1):
@@ -216,11 +216,11 @@ def _start(rig: Rig, lines: CycleRows, prior: Prior, f: int, node: int, scan: Sc
     """
     pip, tried = scan.angles[4 * f + 2], len(KERNEL.tried_rad)
     dip = prior.base_rad[f, 3] + prior.per_pip[f, 3] * pip
-    aside = prior.base_rad[f, 0] + prior.per_pip[f, 0] * pip
+    abduction = prior.base_rad[f, 0] + prior.per_pip[f, 0] * pip
     best, at = inf, tried
     if (node - scan.first[f]) % KERNEL.tried_every == 0:
         for start in range(tried):
-            _put(rig.hand, f, aside, KERNEL.tried_rad[start], dip, prior.twist[f], scan)
+            _put(rig.hand, f, abduction, KERNEL.tried_rad[start], dip, prior.twist[f], scan)
             _look(rig, prior, f, NO_MOVES, scan)
             cost = _rows(rig, lines, prior, f, scan)
             if cost < best:
@@ -232,7 +232,7 @@ def _start(rig: Rig, lines: CycleRows, prior: Prior, f: int, node: int, scan: Sc
             _look(rig, prior, f, NO_MOVES, scan)
             at = tried if _rows(rig, lines, prior, f, scan) < best else at
     if at < tried:
-        _put(rig.hand, f, aside, KERNEL.tried_rad[at], dip, prior.twist[f], scan)
+        _put(rig.hand, f, abduction, KERNEL.tried_rad[at], dip, prior.twist[f], scan)
     return KERNEL.steps_from_node if at == tried else KERNEL.steps_from_tried
 
 
@@ -429,7 +429,7 @@ def choose(rig: Rig, lines: CycleRows, prior: Prior, f: int, scan: Scan) -> None
 
 @inlined
 def _mix(prior: Prior, f: int, low: float, step: float, scan: Scan) -> None:
-    """Write the density `p` of all hands, and `near`, by which its place is chosen."""
+    """Write the density `p` of all hands, and `weighted`, by which its place is chosen."""
     p, total = scan.p, 0.0
     for k in range(_PLACES):
         p[k] = 0.0
@@ -440,37 +440,37 @@ def _mix(prior: Prior, f: int, low: float, step: float, scan: Scan) -> None:
     for k in range(_PLACES):
         p[k] /= total
         off = (low + k * step - prior.last[f]) / prior.process_noise[f]
-        scan.near[k] = p[k] * exp(-0.5 * off * off) if prior.had_previous[f] > 0.0 else p[k]
+        scan.weighted[k] = p[k] * exp(-0.5 * off * off) if prior.had_previous[f] > 0.0 else p[k]
 
 
 @inlined
-def _part(settings: Settings, begin: int, near: Float) -> int:
+def _part(settings: Settings, begin: int, weighted: Float) -> int:
     """Return the end of the part of a density that begins there.
 
     Two tops are of one part where the density does not fall clearly between them. From `begin` up to the
     lowest place before another top, if it clearly falls below both.
     """
-    crest, lowest, low_at = near[begin], inf, begin
+    crest, lowest, low_at = weighted[begin], inf, begin
     for k in range(begin, _PLACES):
-        if lowest < settings.parted * min(crest, near[k]):
+        if lowest < settings.parted * min(crest, weighted[k]):
             return low_at
-        if near[k] > crest:
-            crest, lowest = near[k], inf
-        elif near[k] < lowest:
-            lowest, low_at = near[k], k
+        if weighted[k] > crest:
+            crest, lowest = weighted[k], inf
+        elif weighted[k] < lowest:
+            lowest, low_at = weighted[k], k
     return _PLACES
 
 
 @inner
 def _heaviest(settings: Settings, f: int, scan: Scan) -> tuple[float, int]:
     """Return median and top of the heaviest part, in fine steps, and count parts."""
-    p, near, begin, best_begin, best_end, best, parts = scan.p, scan.near, 0, 0, _PLACES, -1.0, 0
+    p, weighted, begin, best_begin, best_end, best, parts = scan.p, scan.weighted, 0, 0, _PLACES, -1.0, 0
     while begin < _PLACES:
-        end = _part(settings, begin, near)
+        end = _part(settings, begin, weighted)
         weight = likely = 0.0
         for k in range(begin, end):
             weight += p[k]
-            likely += near[k]
+            likely += weighted[k]
         if weight > settings.other_part:
             parts += 1
         if likely > best:
@@ -481,8 +481,8 @@ def _heaviest(settings: Settings, f: int, scan: Scan) -> tuple[float, int]:
     for k in range(best_begin, best_end):
         if p[k] > crest:
             crest, crest_at = p[k], k
-        if not found and half + near[k] >= 0.5 * best:
-            place = k - 0.5 + (0.5 * best - half) / max(near[k], 1e-300)
+        if not found and half + weighted[k] >= 0.5 * best:
+            place = k - 0.5 + (0.5 * best - half) / max(weighted[k], 1e-300)
             found = True
-        half += near[k]
+        half += weighted[k]
     return min(max(place, 0.0), _PLACES - 1.0), crest_at

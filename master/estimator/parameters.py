@@ -45,7 +45,7 @@ class HandParameters:
     high: Float
     legal_low: Float  # (n,) [rad] the limits themselves, low and `legal_high`
     legal_high: Float
-    beyond_w2: Float  # (n,) [1/rad^2] inverse variance by which they are exceeded; 0: not at all
+    limit_w2: Float  # (n,) [1/rad^2] inverse variance by which they are exceeded; 0: not at all
     at_low_limit: Bool  # (n,) whether it often stands at its low bound: that of a straight finger
     abduction: Int | slice  # columns of the K fingers whose abduction narrows: a slice (view) if even,
     flexion: Int | slice  # as this
@@ -151,7 +151,7 @@ class HandTables:
     high: Float = array("n")
     legal_low: Float = array("n")
     legal_high: Float = array("n")
-    beyond_w2: Float = array("n")
+    limit_w2: Float = array("n")
     at_low_limit: Bool = array("n", kind="u1")
     anywhere: Float = array("6+n")
     limits: Float = array(5, 4, 2)  # [rad] low and high of all angles, abductions not narrowed
@@ -202,7 +202,7 @@ class HandTables:
             high=parameters.high,
             legal_low=parameters.legal_low,
             legal_high=parameters.legal_high,
-            beyond_w2=parameters.beyond_w2,
+            limit_w2=parameters.limit_w2,
             at_low_limit=parameters.at_low_limit,
             anywhere=parameters.anywhere,
             limits=model.limits_rad + np.stack([-tolerance, tolerance], axis=2),

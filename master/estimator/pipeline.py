@@ -184,17 +184,17 @@ class OrientationTrack:
         """Take one sample, as of `OrientationSamples.push`."""
         self._samples.push(t_ns, orientation_wxyz, heading_sigma_rad)
 
-    def at(self, t_ns: int, near: SolvedHand | None) -> OrientationMeasurement | None:
-        """Return the palm's orientation at a time, or None; `near` may give the heading."""
+    def at(self, t_ns: int, hand: SolvedHand | None) -> OrientationMeasurement | None:
+        """Return the palm's orientation at a time, or None; `hand` may give the heading."""
         found = self._samples.between(t_ns)
         heading_rad = None if found is None else self._heading_rad(found.drift_rad)
-        if found is None or (heading_rad is None and near is None):
+        if found is None or (heading_rad is None and hand is None):
             self.counts["orientation.absent"] += 1
             return None
         self.counts["orientation.used"] += 1
         rotation = self._rig_world @ matrix_of(found.q_wxyz) @ self._palm_imu.T
-        if heading_rad is None and near is not None:
-            rotation = _twist_about(self._up, near.T_rig_palm[:3, :3] @ rotation.T) @ rotation
+        if heading_rad is None and hand is not None:
+            rotation = _twist_about(self._up, hand.T_rig_palm[:3, :3] @ rotation.T) @ rotation
         tilt_2 = self._imu.orientation_sigma_rad**2 + (DEFAULT.palm_process_noise_rad_s * found.gap_s) ** 2
         about_2 = max((DEFAULT.heading_free_rad if heading_rad is None else heading_rad) ** 2, tilt_2)
         along = np.outer(self._up, self._up)

@@ -118,7 +118,7 @@ def _covariance(problem: Problem, h: int, numbers: float, scratch: Scratch) -> f
             A[i, i] += hand.anywhere[i] - (prior.palm_w2[i] if i < 6 else prior.past_w2[i - 6])
     for i in range(at.x.shape[0]):  # a limit keeps an angle, and measures none
         if at.x[i] > hand.legal_high[i] or at.x[i] < hand.legal_low[i]:
-            A[6 + i, 6 + i] -= hand.beyond_w2[i]
+            A[6 + i, 6 + i] -= hand.limit_w2[i]
     for i in range(3):
         for j in range(i + 1):
             A[3 + i, 3 + j] -= prior.depth_w2[0] * prior.line_of_sight[i] * prior.line_of_sight[j]

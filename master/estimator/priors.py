@@ -363,8 +363,8 @@ def loosened(model: HandModel) -> HandModel:
     """Return the hand with loosely following DIPs and room beyond its limits."""
     limits = model.limits_rad.copy()
     limits[1:, ABDUCTION] = -LAWS.abduction_rad, LAWS.abduction_rad
-    limits[1:, [FLEXION, PIP, DIP], 0] -= LAWS.beyond_rad
-    limits[1:, [FLEXION, PIP, DIP], 1] += LAWS.beyond_rad
+    limits[1:, [FLEXION, PIP, DIP], 0] -= LAWS.slack_rad
+    limits[1:, [FLEXION, PIP, DIP], 1] += LAWS.slack_rad
     ratio = model.dip_per_pip
     if model.profile.couplings is None:
         ratio = LAWS.dip_per_pip

@@ -107,7 +107,7 @@ class Settings:
     coast_s: float = _s(0.16, 0.01, 1.0, _COORDINATION)
     rate_memory_s: float = _s(0.024, 1e-3, 1.0, "half of a new rate counts at 60 frames a second")
     growth_rad: float = _deg(36.0, 0.05, 2.0, _GROWTH)
-    growth_aside_rad: float = _deg(14.0, 0.02, 2.0, _GROWTH)
+    growth_abduction_rad: float = _deg(14.0, 0.02, 2.0, _GROWTH)
     growth_thumb_rad: float = _deg(20.0, 0.02, 2.0, _GROWTH)
     growth_s: float = _s(1.0, 0.05, 10.0, _GROWTH)
     alike: float = _number(0.7, 0.0, 0.99, _COORDINATION)
@@ -184,7 +184,7 @@ class Settings:
         "PIP beyond which a laser point on the last phalanx fits two poses")
     goes_on_rad: float = _deg(8.0, 0.02, 2.0,
         "by which a PIP may have moved at least since the finger was seen")
-    near_rad: float = _deg(32.0, 0.1, 3.0,
+    window_rad: float = _deg(32.0, 0.1, 3.0,
         "about its last PIP in which a finger that is well known is searched")
     search_again: float = _number(6.0, 1.0, 100.0, "strobe cycles after which all is searched")
     hinge_rad: float = _deg(4.0, 0.001, 0.5, "by which real hinges lie askew to those of a hand file")
@@ -362,7 +362,7 @@ class FingerLaws(NamedTuple):
     dip_spread_rad: float = radians(7.0)
     ip_per_mcp: float = 1.1  # of thumbs: between those of grasps and the ratio of the limits
     abduction_rad: float = radians(25.0)  # limit, to both sides
-    beyond_rad: float = radians(8.0)  # other limits: those of a hand file are a prior's, not a wall's
+    slack_rad: float = radians(8.0)  # of other limits: those of a hand file are a prior's, not a wall's
     inside_px: float = 20.0  # from the edge of the image: a fingertip there is clearly in it
 
 

@@ -141,7 +141,7 @@ class Smoothing:
     marker_of: Int = array(5, kind="i8")  # marker of each finger; -1: there is none
     knuckle: Float = array(3)  # [m] the place in the palm frame
     across: Float = array(1)  # [m/rad] by how much a turn counts
-    reach: Float = array(20)  # [m/rad] the angles
+    lever: Float = array(20)  # [m/rad] the angles
     dip_per_pip: Float = array(1)  # how the DIP follows the PIP
     blend_s: Float = array(1)  # in which leaps fade
     tracked_m: Float = array(1)  # how large the region of a tracked joint may be
@@ -172,7 +172,7 @@ def _begun(
         knuckle=knuckle,
         across=np.linalg.norm(rest[TIPS[1:]] - knuckle, axis=1).mean(),
         # The DIP bends with the PIP, so it counts as far.
-        reach=np.linalg.norm(rest[TIPS][:, None] - rest[CHAINS[:, [0, 0, 1, 1]]], axis=2).ravel(),
+        lever=np.linalg.norm(rest[TIPS][:, None] - rest[CHAINS[:, [0, 0, 1, 1]]], axis=2).ravel(),
         dip_per_pip=model.dip_per_pip or 0.0,
         blend_s=settings.blend_s,
         tracked_m=settings.tracked_m,
@@ -192,7 +192,7 @@ def _write_signals(state: Smoothing, solved: Pose) -> None:
     for f in range(5):
         for k in range(4):
             follows = state.dip_per_pip[0] * angles[f, 2] if f > 0 and k == 3 else 0.0
-            state.signals[6 + 4 * f + k] = (angles[f, k] - follows) * state.reach[4 * f + k]
+            state.signals[6 + 4 * f + k] = (angles[f, k] - follows) * state.lever[4 * f + k]
 
 
 @inner
@@ -270,7 +270,7 @@ def _write_pose(hand: HandTables, state: Smoothing, shown: Pose) -> None:
         for j in range(3):
             T[i, 3] -= T[i, j] * state.knuckle[j]
     for a in range(20):
-        angles[a] = state.filtered[6 + a] / state.reach[a]
+        angles[a] = state.filtered[6 + a] / state.lever[a]
         if a > 3 and a % 4 == 3:
             angles[a] += state.dip_per_pip[0] * angles[a - 1]
     clamp(hand, angles)

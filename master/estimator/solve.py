@@ -136,15 +136,15 @@ def _add_priors(problem: Problem, h: int, at: Iterate, search: Search) -> float:
 
 
 @inlined
-def _beyond(hand: HandTables, at: Iterate) -> float:
+def _limit_cost(hand: HandTables, at: Iterate) -> float:
     """Add what angles beyond their limits cost; return it."""
     cost = 0.0
     for i in range(at.x.shape[0]):
         off = max(at.x[i] - hand.legal_high[i], 0.0) + min(at.x[i] - hand.legal_low[i], 0.0)
         if off != 0.0:
-            cost += 0.5 * hand.beyond_w2[i] * off * off
-            at.gradient[6 + i] += hand.beyond_w2[i] * off
-            at.normal[6 + i, 6 + i] += hand.beyond_w2[i]
+            cost += 0.5 * hand.limit_w2[i] * off * off
+            at.gradient[6 + i] += hand.limit_w2[i] * off
+            at.normal[6 + i, 6 + i] += hand.limit_w2[i]
     return cost
 
 
@@ -176,7 +176,7 @@ def linearise(problem: Problem, h: int, at: Iterate, search: Search) -> float:
     rig, epoch_prior, T, z = problem.rig, problem.epoch_prior, at.palm, at.z
     hand, work = rig.hand, search.rows
     cost = _add_priors(problem, h, at, search)
-    cost += _beyond(hand, at)
+    cost += _limit_cost(hand, at)
     if epoch_prior.back_normal_w2[0] > 0.0:
         cost += _faced(epoch_prior, at)
     if epoch_prior.oriented[0] > 0.0:

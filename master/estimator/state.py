@@ -107,7 +107,7 @@ def growth(settings: Settings, a: int, gone_s: float) -> float:
     if a < 4:
         most = settings.growth_thumb_rad
     elif a % 4 == 0:
-        most = settings.growth_aside_rad
+        most = settings.growth_abduction_rad
     return most**2 * (1.0 - exp(-((gone_s / settings.growth_s) ** 2)))
 
 

@@ -79,7 +79,7 @@ def _expected(rig: Rig, state: HandState, task: Task, lines: CycleRows, scan: Sc
         known = had_previous and well and age_s <= settings.tracked_cycle_s
         state.searched[f] = state.searched[f] + 1 if known else 0
         known = known and state.searched[f] % settings.search_again != 0
-        prior.near_rad[f] = settings.near_rad if known else 0.0
+        prior.window_rad[f] = settings.window_rad if known else 0.0
         for k in range(4 * f, 4 * f + 4):
             scan.angles[k] = settings.curled_rad  # somewhere
             if had_previous:
@@ -147,8 +147,8 @@ def _scan(rig: Rig, lines: CycleRows, prior: Prior, f: int, scan: Scan, task: Ta
     scan_finger(rig, lines, prior, f, scan)
     if loosen_short(rig.device, lines, f, _length_px(scan, f), scan.g[:3], scan.H[:2, :2]):
         scan_finger(rig, lines, prior, f, scan)
-    if prior.near_rad[f] > 0.0 and scan.chi2[f] > settings.refused:
-        prior.near_rad[f] = 0.0
+    if prior.window_rad[f] > 0.0 and scan.chi2[f] > settings.refused:
+        prior.window_rad[f] = 0.0
         scan_finger(rig, lines, prior, f, scan)
     if scan.chi2[f] > settings.refused and lines.depth_w2[f] > 0.0:
         # a tip may shine, or lie in shade: what it is off then is its light

@@ -72,7 +72,7 @@ class _Hand(NamedTuple):
     process_noise: Float  # (K,) tilt growth to a fit that starts there, as a share of its variance
 
 
-class _Placed(NamedTuple):
+class _Positions(NamedTuple):
     """As of `RayPositions`, which is made of it."""
 
     points: Float
@@ -158,7 +158,9 @@ def _correct(rig: _Rig, hand: _Hand, observed: Float, m: int) -> tuple[int, floa
 
 
 @inner
-def _place(rig: _Rig, hand: _Hand, observed: Float, rejected: Bool, m: int) -> tuple[int, bool, int, float]:
+def _triangulate(
+    rig: _Rig, hand: _Hand, observed: Float, rejected: Bool, m: int
+) -> tuple[int, bool, int, float]:
     """Triangulate marker m by the cameras that are not rejected.
 
     Returns how many see it; whether their rays meet; and as `_correct`.
@@ -186,7 +188,7 @@ def _monocular(rig: _Rig, hand: _Hand, observed: Float, m: int) -> None:
 
 
 @kernel
-def correct_centres(rig: _Rig, hand: _Hand, observed: Float, out: _Placed) -> None:
+def correct_centres(rig: _Rig, hand: _Hand, observed: Float, out: _Positions) -> None:
     """Locate M markers with covariance.
 
     `observed` (C, M, 4): u, v, sigma [px], area [px^2]; NaN: not seen. `out` is written.
@@ -195,12 +197,12 @@ def correct_centres(rig: _Rig, hand: _Hand, observed: Float, out: _Placed) -> No
     for m in range(observed.shape[1]):
         for c in range(observed.shape[0]):
             rejected[c, m] = False
-        seen, meets, count, shared = _place(rig, hand, observed, rejected, m)
+        seen, meets, count, shared = _triangulate(rig, hand, observed, rejected, m)
         if seen >= 3 and not meets:  # one may be an outlier
             outlying = outlier(cameras, rig.limits[seen - 1], rays)
             if outlying >= 0:
                 rejected[outlying, m] = True
-                seen, meets, count, shared = _place(rig, hand, observed, rejected, m)
+                seen, meets, count, shared = _triangulate(rig, hand, observed, rejected, m)
                 rejected[outlying, m] = meets
         out.outliers[m] = seen >= 2 and not meets
         row, cov, own = rig.caps.row[m], out.cov[m], out.own[m]
@@ -292,7 +294,7 @@ class RayTriangulator:
         directions = _Hand(hand is not None, as_seen, R, tilt, rotation_rad2, *about)
         places = np.empty((count, 3)), np.empty((count, 3, 3)), np.empty((count, 3, 3))
         flags = np.empty(count, np.bool_), np.empty(shape, np.bool_)
-        out = _Placed(*places, *flags, np.empty((*shape, 2)), np.empty(shape), np.empty((count, 3, 3)))
+        out = _Positions(*places, *flags, np.empty((*shape, 2)), np.empty(shape), np.empty((count, 3, 3)))
         if self._correct_centres is None:
             self._correct_centres = bound(correct_centres, self._rig, directions, observed, out)
         self._correct_centres(self._rig, directions, observed, out)

@@ -203,7 +203,7 @@ def _across(ahead: Float, tilt: Float, out: Float) -> None:
 
 
 @kernel
-def _place(
+def _without_bias(
     tables: DisparityTables, uv: Float, m: int, bias: Float, ray: Float, point: Float
 ) -> tuple[float, float]:
     """Place centroids of marker m less `bias` (2, 2) [px], as `place_centroids`."""
@@ -268,7 +268,7 @@ def _cap_spread(
         for c in range(2):
             work.whole[0, c] = max(work.whole[0, c], work.shown[c])
         off[:] = np.nan
-        _place(tables, uv, m, bias, by[2], off)
+        _without_bias(tables, uv, m, bias, by[2], off)
         for a in range(3):
             for b in range(3):
                 cov[m, a, b] += (off[a] - points[m, a]) * (off[b] - points[m, b])
@@ -338,14 +338,14 @@ def triangulate(
         whole[:], bias[:] = 0.0, 0.0
         row = caps.row[m]
         known = row >= 0 and np.isfinite(ahead[m, 0])
-        z, rows = _place(tables, uv, m, bias, ray, point)
+        z, rows = _without_bias(tables, uv, m, bias, ray, point)
         if not np.isfinite(z):
             continue
         if known:
             cap_bias(tables, caps, row, ahead[m], point, bias, whole[0])
             for k in range(3):
                 aim[k] = point[k]
-            z, rows = _place(tables, uv, m, bias, ray, point)
+            z, rows = _without_bias(tables, uv, m, bias, ray, point)
             if not np.isfinite(z):  # so near that what is seen of the cap is no disparity
                 continue
             _cap_spread(tables, caps, uv, m, ahead[m], tilt[m], work, points, cov)

@@ -52,7 +52,7 @@ def test_the_box_is_that_of_the_limits_and_their_reach() -> None:
     parameters = HandParameters.of(SOFT)
     sigma = SOFT.tolerance_rad.reshape(20)[parameters.free]
     np.testing.assert_allclose(parameters.legal_low - parameters.low, KERNEL.tolerances * sigma)
-    np.testing.assert_allclose(parameters.beyond_w2, sigma**-2.0)
+    np.testing.assert_allclose(parameters.limit_w2, sigma**-2.0)
     walls = HandParameters.of(RIGHT)
     np.testing.assert_array_equal(walls.low, walls.legal_low)
-    assert not walls.beyond_w2.any()
+    assert not walls.limit_w2.any()
