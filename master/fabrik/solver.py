@@ -24,14 +24,12 @@ from master.estimator.parameters import Mounts
 from master.estimator.posterior import ON_MARKERS
 from master.estimator.state import PALM_PART
 from master.fabrik.closed_form import (
-    back_normal_of,
     closed_form,
     distance2_of,
     distances2,
     nearest_pose,
-    targets_of,
 )
-from master.fabrik.fabrik import Chain, Coupling, Link, solve_chain
+from master.fabrik.fabrik import Chain, Coupling, Link, back_normal_of, solve_chain, targets_of
 from master.fabrik.joints import ChainArrays, Hinge, Rotor, end_of
 from master.fabrik.linear_algebra import IDENTITY, Vector, as_matrix, as_vector, length, minus
 from master.fabrik.one_euro import PointFilter

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from master.fabrik.closed_form import back_normal_of, targets_of
+from master.fabrik.fabrik import back_normal_of, targets_of
 from tests.hand_helpers import palm
 
 
