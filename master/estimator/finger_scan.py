@@ -429,7 +429,7 @@ def choose(rig: Rig, lines: CycleRows, prior: Prior, f: int, scan: Scan) -> None
 
 @inlined
 def _mix(prior: Prior, f: int, low: float, step: float, scan: Scan) -> None:
-    """Write the density `p` of all hands, and `weighted`, by which its place is chosen."""
+    """Write the density `p` of all hands; by `weighted` its place is chosen."""
     p, total = scan.p, 0.0
     for k in range(_PLACES):
         p[k] = 0.0
