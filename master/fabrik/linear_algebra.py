@@ -276,14 +276,49 @@ def inverse_3_plus(A: Float, extra: float, out: Float) -> None:
 def diagonalise(A: Float, V: Float) -> None:
     """Turn symmetric A (n, n) into its eigenvalues, V into its eigenvectors.
 
-    They come to stand on the diagonal of A, unsorted, and in the columns of V. Only the lower triangle of A is
-    read. NaN stays NaN.
+    They come to stand on the diagonal of A, unsorted, and in the columns of V (cyclic Jacobi, as `eigen`).
+    Only the lower triangle of A is read. NaN stays NaN.
     """
     n = A.shape[0]
     for i in range(n):
-        for j in range(i):
-            A[j, i] = A[i, j]
-    eigen(A, n, np.empty(n), V)
+        for j in range(n):
+            V[i, j] = 1.0 if i == j else 0.0
+    nothing = 1e-36  # squares of what is beside the diagonal, by those on it
+    for _ in range(FABRIK.sweeps):
+        off, on = 0.0, 0.0
+        for i in range(n):
+            on += A[i, i] * A[i, i]
+            for j in range(i):
+                off += A[i, j] * A[i, j]
+        if not off > nothing * on:
+            return
+        for q in range(1, n):
+            for p in range(q):
+                _rotate(A, V, p, q)
+
+
+@inner
+def _rotate(A: Float, V: Float, p: int, q: int) -> None:
+    """Turn axes p < q by what makes A[q, p] zero."""
+    n, a = A.shape[0], A[q, p]
+    if a == 0.0:
+        return
+    half = 0.5 * (A[q, q] - A[p, p]) / a
+    t = 1.0 / (abs(half) + sqrt(half * half + 1.0))
+    t = -t if half < 0.0 else t
+    c = 1.0 / sqrt(t * t + 1.0)
+    s = t * c
+    for k in range(n):
+        if k not in (p, q):
+            i, j = max(k, p), min(k, p)
+            m, o = max(k, q), min(k, q)
+            x, y = A[i, j], A[m, o]
+            A[i, j], A[m, o] = c * x - s * y, s * x + c * y
+        x, y = V[k, p], V[k, q]
+        V[k, p], V[k, q] = c * x - s * y, s * x + c * y
+    A[p, p] -= t * a
+    A[q, q] += t * a
+    A[q, p] = 0.0
 
 
 @kernel
