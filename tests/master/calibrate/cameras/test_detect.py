@@ -8,6 +8,7 @@ import pytest
 
 from common.arrays import Image
 from common.errors import CalibrationError, FitError
+from common.geometry.transforms import axis_rotation, rigid
 from master.calibrate.cameras.boards import Board, Charuco, Checkerboard, board_corners, find_board, orderings
 from master.calibrate.cameras.views import look
 from tests.master.calibrate.cameras.board_images import render
@@ -128,3 +129,15 @@ def test_impossible_boards_are_refused() -> None:
         2,
         4,
     ]
+
+
+def test_corners_of_a_board_seen_from_the_side_are_as_good() -> None:
+    truth = scene(28, 1, views=1, board=Charuco(4, 5, 0.054, 0.0405))
+    middle = board_corners(truth.board).mean(axis=0)
+    for tilt_deg in (60.0, 66.0, 70.0):
+        turn = axis_rotation(2, 0.6) @ axis_rotation(1, np.radians(tilt_deg)) @ axis_rotation(2, 0.4)
+        tilted = replace(truth, T_rig_board=rigid(turn, np.array([0.0, 0.0, 0.6]) - turn @ middle)[None])
+        seen = find_board(truth.board, render(tilted, 0, "left", seed=28, blur_px=0.5))
+        assert seen is not None
+        assert seen.seen == 12
+        assert np.sqrt(np.mean((seen.corners_px - tilted.corners(0, "left")) ** 2)) < 0.2
