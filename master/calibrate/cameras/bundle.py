@@ -2,7 +2,9 @@
 
 Corner i of an image is seen at pixel = lens(T_camera_rig T_rig_board (c_i + s_i)), where c_i is the drawn
 corner and s_i its offset on the real, never quite flat board. The board's pose is a view's own unknown
-(`master.calibrate.adjust`), all else is shared. A prior of the shape about the drawn one also fixes the
+(`master.calibrate.adjust`), and so is how late each of its frames is in truth: a stamp that a program
+gives is early or late by some milliseconds, which at 100 px/s moves all corners of an image together. All
+else is shared. A prior of the shape about the drawn one also fixes the
 board's frame and size: few views leave it as drawn. Lenses have a weak prior: what corners in a small part of
 the image hardly determine stays near that of an ordinary lens, and its standard deviation says so.
 """
@@ -43,6 +45,8 @@ class Bundle:
     drawn_m: Float
     shape_m: Float
     delay_s: Float  # (C,) by which frames were taken later than their times state
+    late_s: Float | None = None  # (V, C) by which one frame was later than that; None: not estimated
+    late_sd_s: float = 0.0  # standard deviation of that; 0: it is not estimated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,6 +118,8 @@ def solve(
 
     def equations(bundle: Bundle) -> Normal:
         normal = _equations(images, bundle, mask, prior_px_m, cauchy_px)
+        if bundle.late_s is not None:
+            _add_late(normal, bundle.late_s, sigma_px / bundle.late_sd_s)
         if sigma_px == 0.0:
             return normal
         away, sd = lens_prior(bundle)
@@ -132,6 +138,8 @@ def solve(
         return _retracted(bundle, shared, own)
 
     # robust fits only judge
+    if start.late_s is None and start.late_sd_s > 0.0:
+        start = replace(start, late_s=np.zeros((len(start.T_rig_board), len(start.lenses))))
     found = minimise(equations, stepped, start, gain_share=1e-8 if cauchy_px is None else 1e-6)
     return _solution(observations, found, mask, free)
 
@@ -164,12 +172,38 @@ def _add_unfolded(normal: Normal, bundle: Bundle, free: Bool, sigma_px: float) -
             normal.add(np.array([[by @ lens]]), by[None, None, terms], columns=column[terms])
 
 
+def lateness(observations: Sequence[Observation], bundle: Bundle) -> Bundle:
+    """Measure how far single frames are from their times, for the next step.
+
+    Frames of a fast board count more: of a slow one all kinds of errors look like much time.
+    """
+    if bundle.late_s is None or len(bundle.lenses) < 2:
+        return bundle
+    moving = [seen for seen in observations if seen.speed is not None]
+    late_s = np.array([bundle.late_s[seen.view, seen.camera] for seen in moving])
+    weight = np.array([np.mean(np.square(seen.speed)) for seen in moving])
+    # What all frames of a view share is a place of the board.
+    share = 1.0 - 1.0 / len(bundle.lenses)
+    sd_s = float(np.sqrt((weight * late_s**2).sum() / max(float(weight.sum()), 1e-12) / share))
+    return replace(bundle, late_sd_s=min(max(sd_s, 1e-3), 0.03))
+
+
+def _add_late(normal: Normal, late_s: Float, weight: float) -> None:
+    """Add the prior of late frames: `weight` [1/s] is 1 over its deviation."""
+    normal.cost += weight**2 * float((late_s**2).sum())
+    np.einsum("vii->vi", normal.own)[:, 6:] += weight**2
+    normal.own_gradient[:, 6:] += weight**2 * late_s
+
+
 def predict(bundle: Bundle, seen: Observation) -> Float:
     """Pixels (n, 2) where the corners of an observation should be, as of its time."""
     on_board = bundle.drawn_m[seen.corners] + bundle.shape_m[seen.corners]
     points = transform(bundle.T_camera_rig[seen.camera] @ bundle.T_rig_board[seen.view], on_board)
     found = project(points, bundle.lenses[seen.camera])
-    return found if seen.speed is None else found - seen.speed * bundle.delay_s[seen.camera]
+    if seen.speed is None:
+        return found
+    late_s = 0.0 if bundle.late_s is None else bundle.late_s[seen.view, seen.camera]
+    return found - seen.speed * (bundle.delay_s[seen.camera] + late_s)
 
 
 def project(points_m: Float, lens: Float) -> Float:
@@ -219,8 +253,8 @@ def _stacked(observations: Sequence[Observation], corners: int) -> list[_Images]
 def _jacobian(images: _Images, bundle: Bundle) -> tuple[Float, Float, Float, Float, Float]:
     """Predicted minus seen corners (E, N, 2), and their derivatives.
 
-    By lens (E, N, 2, 9), pose of camera and of board (E, N, 2, 6) each, shape (E, N, 2, 3). A pose rotates by
-    exp(w) on its left and moves by t.
+    By lens (E, N, 2, 9), pose of camera (E, N, 2, 6), own unknowns of the view (E, N, 2, 6 or 6 + C), shape
+    (E, N, 2, 3). A pose rotates by exp(w) on its left and moves by t.
     """
     T_rig_board, T_camera_rig = bundle.T_rig_board[images.views], bundle.T_camera_rig[images.camera]
     rotation_v, rotation_c = T_rig_board[:, :3, :3], T_camera_rig[:3, :3]
@@ -228,13 +262,17 @@ def _jacobian(images: _Images, bundle: Bundle) -> tuple[Float, Float, Float, Flo
     in_rig = turned + T_rig_board[:, None, :3, 3]
     points, lens = transform(T_camera_rig, in_rig).reshape(-1, 3), bundle.lenses[images.camera]
     projected, derivatives = cv2.projectPoints(points, _ZERO, _ZERO, _matrix(lens), lens[4:])
-    seen = images.uv + images.speed * bundle.delay_s[images.camera]
+    late_s = np.zeros((1, 0)) if bundle.late_s is None else bundle.late_s[images.views]
+    delay_s = bundle.delay_s[images.camera] + late_s[:, images.camera : images.camera + 1].sum(axis=1)
+    seen = images.uv + images.speed * delay_s[:, None, None]
     off = np.asarray(projected, dtype=np.float64).reshape(seen.shape) - seen
     by_all = np.asarray(derivatives, dtype=np.float64).reshape(*off.shape, -1)
     by_point, by_lens = by_all[..., 3:6], by_all[..., 6:15]
     by_camera = np.concatenate([-by_point @ skew(in_rig @ rotation_c.T), by_point], axis=-1)
     by_rig = by_point @ rotation_c
-    by_view = np.concatenate([-by_rig @ skew(turned), by_rig], axis=-1)
+    by_late = np.zeros((*off.shape, late_s.shape[1]))
+    by_late[..., images.camera : images.camera + 1] = -images.speed[..., None]
+    by_view = np.concatenate([-by_rig @ skew(turned), by_rig, by_late], axis=-1)
     return off, by_lens, by_camera, by_view, by_rig @ rotation_v[:, None]
 
 
@@ -243,7 +281,8 @@ def _equations(
 ) -> Normal:
     """Normal equations [px] of the free unknowns, with the prior of the shape."""
     cameras, shape_at = len(bundle.lenses), 16 * len(bundle.lenses)
-    normal = Normal(len(mask), len(bundle.T_rig_board), 6)
+    late = 0 if bundle.late_s is None else cameras
+    normal = Normal(len(mask), len(bundle.T_rig_board), 6 + late)
     loss = None if cauchy_px is None else cauchy(cauchy_px)
     for own in images:
         off, by_lens, by_camera, by_view, by_shape = _jacobian(own, bundle)
@@ -268,7 +307,7 @@ def _equations(
             normal.shared[shape_at:, at] += cross.T
             normal.gradient[shape_at:] += _einsum("enri,enr->ni", heavy, off).ravel()
             mixed = _einsum("enrb,enrj->ebnj", by_view, heavy)
-            normal.mixed[own.views, :, shape_at:] += mixed.reshape(count, 6, -1)
+            normal.mixed[own.views, :, shape_at:] += mixed.reshape(count, 6 + late, -1)
     if prior_px_m > 0.0:
         away, sigma = np.zeros(len(mask)), np.full(len(mask), np.inf)
         away[shape_at:], sigma[shape_at:] = bundle.shape_m.ravel(), 1.0 / prior_px_m
@@ -290,7 +329,8 @@ def _retracted(bundle: Bundle, shared: Float, own: Float) -> Bundle:
         bundle,
         lenses=bundle.lenses + shared[: 9 * cameras].reshape(cameras, 9),
         T_camera_rig=stepped_poses(bundle.T_camera_rig, places),
-        T_rig_board=stepped_poses(bundle.T_rig_board, own),
+        T_rig_board=stepped_poses(bundle.T_rig_board, own[:, :6]),
+        late_s=None if bundle.late_s is None else bundle.late_s + own[:, 6:],
         delay_s=bundle.delay_s + shared[15 * cameras : 16 * cameras],
         shape_m=bundle.shape_m + shared[16 * cameras :].reshape(-1, 3),
     )
@@ -305,6 +345,7 @@ def _solution(
     # The prior takes the place of measurements for what the shape cannot learn: seven numbers of its frame and size.
     spent = int(mask[: 16 * len(bundle.lenses)].sum()) + 6 * len(bundle.T_rig_board)
     spent += 3 * len(bundle.drawn_m) - 7 if free.shape else 0
+    spent += 0 if bundle.late_s is None else len(observations)
     sigma = float(np.sqrt(sum(float((r**2).sum()) for r in residuals) / max(numbers - spent, 1)))
     covariance = np.zeros((len(mask), len(mask)))
     if mask.any():

@@ -16,7 +16,17 @@ from common.errors import FitError
 from common.geometry.lens import Fold, Lens, fold_of
 from common.geometry.transforms import fit_rigid, invert, transform
 from master.calibrate.cameras.boards import Board, board_corners, orderings
-from master.calibrate.cameras.bundle import Bundle, Free, Observation, Solution, predict, project, rms, solve
+from master.calibrate.cameras.bundle import (
+    Bundle,
+    Free,
+    Observation,
+    Solution,
+    lateness,
+    predict,
+    project,
+    rms,
+    solve,
+)
 from master.calibrate.cameras.outliers import (
     MIN_SHAPE_VIEWS,
     MIN_VIEWS,
@@ -165,7 +175,12 @@ class CamerasFit:
 
 
 def fit_cameras(
-    views: BoardViews, held: Mapping[str, Float] | None = None, *, bent: bool | None = None
+    views: BoardViews,
+    held: Mapping[str, Float] | None = None,
+    *,
+    bent: bool | None = None,
+    near: Mapping[str, Float] | None = None,
+    late_sd_s: float = 0.0,
 ) -> CamerasFit:
     """Lenses and poses of all cameras of `views`.
 
@@ -173,12 +188,15 @@ def fit_cameras(
         held: Camera -> known lens (9,), in the order of `bundle.LENS`; those of the others are estimated.
         bent: Estimate the board's shape too; False: it is exactly as drawn (a print on glass, a screen);
             None: the one that predicts held-out views better, flat where that is not certain.
+        near: Camera -> lens (9,) of an earlier fit, to begin with.
+        late_sd_s: Standard deviation of single frames' times [s], to begin with; 0: they are exact.
 
     Raises:
         FitError: The views do not determine what is asked for; the message states what is missing.
     """
     held = held or {}
-    alone = {camera: fit_alone(views, camera, held.get(camera)) for camera in views.cameras}
+    near = near or {}
+    alone = {camera: fit_alone(views, camera, held.get(camera), near.get(camera)) for camera in views.cameras}
     links = link(views.board, views.cameras, {camera: fit.T_camera_board for camera, fit in alone.items()})
     if all(seen.speed_px_s is None for view in views.views for seen in view.observations.values()):
         _refuse_moved(views, alone, links)  # of frames with times, those of a moving board have a lag as well
@@ -192,6 +210,7 @@ def fit_cameras(
         drawn_m=drawn,
         shape_m=np.zeros_like(drawn),
         delay_s=np.zeros(len(views.cameras)),
+        late_sd_s=late_sd_s,
     )
     if bent is not None:
         return _fit(seen, alone, start, held, BoardChoice(bent, reason="as asked for"))
@@ -219,23 +238,24 @@ def fit_tracks(
     Raises:
         FitError: As `fit_cameras`.
     """
-    delay_s = dict.fromkeys(tracks.cameras, 0.0)
+    delay_s, near = dict.fromkeys(tracks.cameras, 0.0), dict[str, Float]()
     rounds, settled_s = 8, 1e-3
-    for _ in range(rounds):
-        fit = fit_cameras(tracks.views(delay_s), held, bent=False)
-        steps = fit.solution.bundle.delay_s
+    usual_s = 0.01  # a program that asks a camera of 30 Hz gets a frame that is up to 33 ms old
+    settled, final = False, False
+    while not final:
+        rounds -= 1
+        views, final = tracks.views(delay_s), settled or rounds < 0
+        late_sd_s = usual_s if final else 0.0
+        fit = fit_cameras(views, held, bent=bent if final else False, near=near, late_sd_s=late_sd_s)
+        steps, near = (
+            fit.solution.bundle.delay_s,
+            dict(zip(views.cameras, fit.solution.bundle.lenses, strict=True)),
+        )
         delay_s = {
             name: delay_s[name] + float(step) for name, step in zip(tracks.cameras, steps, strict=True)
         }
-        if np.abs(steps).max() < settled_s:
-            break
-    views = tracks.views(delay_s)
-    fit = fit_cameras(views, held, bent=bent)
-    steps = fit.solution.bundle.delay_s
-    return replace(
-        fit,
-        delay_s={name: delay_s[name] + float(step) for name, step in zip(tracks.cameras, steps, strict=True)},
-    )
+        settled = np.abs(steps).max() < settled_s
+    return replace(fit, delay_s=delay_s)
 
 
 def _refuse_moved(views: BoardViews, alone: Mapping[str, Alone], links: Links) -> None:
@@ -329,7 +349,8 @@ def _robust(
     observations = seen.observations(shots)
     bundle = place_boards(observations, bundle)
     for shape in (False, True) if bent else (False,):
-        bundle = solve(observations, bundle, replace(free, shape=shape), 3 * sigma, sigma).bundle
+        robust = solve(observations, bundle, replace(free, shape=shape), 3 * sigma, sigma).bundle
+        bundle = lateness(observations, robust)
         distances = [np.linalg.norm(o.uv - predict(bundle, o), axis=1) for o in observations]
         sigma = max(float(np.median(np.concatenate(distances))) / 1.1774, 1e-3)
     return bundle, sigma

@@ -98,12 +98,12 @@ def corners_seen(observation: ImageObservation) -> tuple[Int, Float]:
     return seen, observation.corners_px[seen]
 
 
-def fit_alone(views: BoardViews, camera: str, held: Float | None = None) -> Alone:
+def fit_alone(views: BoardViews, camera: str, held: Float | None = None, near: Float | None = None) -> Alone:
     """Lens and board poses from one camera's images, without the wrong ones.
 
     Images are judged by a robust fit to all: blurred ones are out, and those with errors beyond `limit`. Then
     the lens is fitted to the good ones and all are judged again until nothing changes, so an image may come
-    back. With a known lens `held` (9,) the images are judged only.
+    back. With a known lens `held` (9,) the images are judged only; `near` (9,) is one to begin with.
 
     Raises:
         FitError: Too few images, or too few that agree with each other.
@@ -121,13 +121,16 @@ def fit_alone(views: BoardViews, camera: str, held: Float | None = None) -> Alon
     seen = [corners_seen(observation) for _, observation in observations]
     blurred = _blurred(np.array([observation.blur_px for _, observation in observations]))
     sharp = [seen[i] for i in range(len(seen)) if i not in blurred]
-    lens = guess_lens(sharp, drawn, views.sizes_px[camera]) if held is None else held
+    begin = near if held is None else held
+    lens = guess_lens(sharp, drawn, views.sizes_px[camera]) if begin is None else begin
     good = [i for i in range(len(seen)) if i not in blurred]
     errors, bound, sigma = np.zeros(len(seen)), np.inf, 1.0
     dof = np.array([2.0 * len(uv) - 6.0 for _, uv in seen])
     for round_ in range(_ROUNDS):
         if held is None:
-            lens, sigma = _robust(good, seen, drawn, lens, views.sizes_px[camera], first=round_ == 0)
+            lens, sigma = _robust(
+                good, seen, drawn, lens, views.sizes_px[camera], first=round_ == 0 and near is None
+            )
         placed = [place_board(drawn[corners], uv, lens) for corners, uv in seen]
         errors = np.array([error for _, error in placed])
         bound = limit(errors, dof)
@@ -247,11 +250,11 @@ def place_boards(observations: Sequence[Observation], bundle: Bundle) -> Bundle:
         for seen in own:
             T_camera_board, _ = place_board(bundle.drawn_m[seen.corners], seen.uv, bundle.lenses[seen.camera])
             T = invert(bundle.T_camera_rig[seen.camera]) @ T_camera_board
-            alone = replace(bundle, T_rig_board=T[None])
+            alone = replace(bundle, T_rig_board=T[None], late_s=None)
             off = [rms([other.uv - predict(alone, replace(other, view=0))]) for other in own]
             tried.append((float(np.nan_to_num(np.median(off), nan=np.inf)), T))
         places.append(min(tried, key=lambda pair: pair[0])[1])
-    return replace(bundle, T_rig_board=np.stack(places))
+    return replace(bundle, T_rig_board=np.stack(places), late_s=None)
 
 
 def judge(

@@ -64,7 +64,7 @@ def test_the_lag_of_a_cameras_times_and_its_place_are_found_from_a_waved_board()
         )
         tracks[camera] = Track(tuple(range(frames)), stamps(camera, frames), found)
     fit = fit_tracks(Tracks(BOARD, dict.fromkeys(tracks, SIZE), tracks), bent=False)
-    assert fit.delay_s["right"] == pytest.approx(LAG_S, abs=0.002)
+    assert fit.delay_s["right"] == pytest.approx(LAG_S, abs=0.004)
     assert fit.delay_s["left"] == 0.0
     assert off_mm(fit.solution.bundle.T_camera_rig[1], truth) < 1.5
     assert len({shot.view for shot in fit.shots}) <= 60
