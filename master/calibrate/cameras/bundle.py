@@ -179,9 +179,8 @@ def lateness(observations: Sequence[Observation], bundle: Bundle) -> Bundle:
     """
     if bundle.late_s is None or len(bundle.lenses) < 2:
         return bundle
-    moving = [seen for seen in observations if seen.speed is not None]
-    late_s = np.array([bundle.late_s[seen.view, seen.camera] for seen in moving])
-    weight = np.array([np.mean(np.square(seen.speed)) for seen in moving])
+    late_s = np.array([bundle.late_s[seen.view, seen.camera] for seen in observations])
+    weight = np.array([0.0 if seen.speed is None else float((seen.speed**2).mean()) for seen in observations])
     # What all frames of a view share is a place of the board.
     share = 1.0 - 1.0 / len(bundle.lenses)
     sd_s = float(np.sqrt((weight * late_s**2).sum() / max(float(weight.sum()), 1e-12) / share))

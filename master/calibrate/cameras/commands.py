@@ -24,8 +24,8 @@ from master.calibrate.cameras.fit import CamerasFit, fit_cameras, fit_tracks
 from master.calibrate.cameras.result import CamerasResult, report_json, report_lines, result
 from master.calibrate.cameras.tracks import Tracks, streams_of, track
 from master.calibrate.cameras.views import BoardViews, View, image_sets, look
-from master.calibrate.tree_files import lens_of, matrix_of, print_lines, provenance, write_camera, write_rig
-from master.commands.summary import write_summary
+from master.calibrate.report import finish
+from master.calibrate.tree_files import lens_of, matrix_of, provenance, write_camera, write_rig
 from master.fabrik.depth import law_contradicts
 
 NEUTRAL = "mode, exposure, gain, colours and row time are neutral values, not measured"
@@ -33,18 +33,20 @@ NEUTRAL = "mode, exposure, gain, colours and row time are neutral values, not me
 
 def known_camera(name: str, calibration: Path, out: Path | None) -> CameraCalibration | None:
     """The camera's file of `out`, else of `calibration`; None: there is none."""
-    for tree in (out, calibration):
-        if tree is not None and (path := tree / "cameras" / f"{name}.json").exists():
-            return load(path, CameraCalibration)
-    return None
+    path = _known(f"cameras/{name}.json", calibration, out)
+    return None if path is None else load(path, CameraCalibration)
 
 
 def known_rig(name: str, calibration: Path, out: Path | None) -> RigCalibration | None:
     """The rig's file of `out`, else of `calibration`; None: there is none."""
-    for tree in (out, calibration):
-        if tree is not None and (path := tree / "rigs" / f"{name}.json").exists():
-            return load(path, RigCalibration)
-    return None
+    path = _known(f"rigs/{name}.json", calibration, out)
+    return None if path is None else load(path, RigCalibration)
+
+
+def _known(file: str, calibration: Path, out: Path | None) -> Path | None:
+    return next(
+        (tree / file for tree in (out, calibration) if tree is not None and (tree / file).exists()), None
+    )
 
 
 def check_size(camera: CameraCalibration, size_px: tuple[int, int]) -> None:
@@ -195,22 +197,21 @@ def intrinsics(options: Namespace) -> None:
     seen = _seen(options)
     views = seen if isinstance(seen, BoardViews) else seen.views(dict.fromkeys(seen.cameras, 0.0))
     known = _known_cameras(views, options.calibration, options.out)
-    results: dict[str, CamerasResult] = {}
-    for name in views.cameras:
-        fit = fit_cameras(_only(views, name), bent=_bent(flat=options.flat_board, bent=options.bent_board))
-        results[name] = result(fit, {})
-        print_lines(report_lines(results[name]))
-        _draw(options.picture if len(views.cameras) == 1 else _named(options.picture, name), fit)
-    files: dict[str, CameraCalibration] = {}
-    for name, own in results.items():
-        how = lens_provenance(own, name, "calibrate cameras intrinsics", (_source_name(options.source),))
-        lens = own.lenses[name].intrinsics
-        files[name] = camera_with_lens(known[name], name, views.sizes_px[name], lens, how)
-    if options.json_file is not None:
-        write_summary(
-            options.json_file, {"cameras": {name: report_json(own) for name, own in results.items()}}
-        )
-    _written([] if options.out is None else write_files(options.out, files, {}), known)
+    bent = _bent(flat=options.flat_board, bent=options.bent_board)
+    fits = {name: fit_cameras(_only(views, name), bent=bent) for name in views.cameras}
+    results = {name: result(fit, {}) for name, fit in fits.items()}
+
+    def write(out: Path) -> dict[Path, str]:
+        files = _with_lenses(views, known, results, "calibrate cameras intrinsics", options.source)
+        return _named(write_files(out, files, {}), known)
+
+    finish(
+        options,
+        (line for own in results.values() for line in report_lines(own)),
+        {"cameras": {name: report_json(own) for name, own in results.items()}},
+        lambda path: draw_views(path, tuple(fits.values())),
+        write,
+    )
 
 
 def stereo(options: Namespace) -> None:
@@ -233,28 +234,42 @@ def stereo(options: Namespace) -> None:
             held[name] = lens_of(file.intrinsics)
     fit = _fit(views, held, options)
     found = result(fit, held)
-    print_lines(report_lines(found))
-    _draw(options.picture, fit)
-    data = (_source_name(options.source),)
+    tool = "calibrate cameras stereo"
+
+    def write(out: Path) -> dict[Path, str]:
+        results = {name: found for name in views.cameras if name not in held}
+        files = _with_lenses(views, known, results, tool, options.source)
+        how = places_provenance(found, tool, (_source_name(options.source),))
+        rig = rig_with_places(rig_known, options.rig, dict(found.T_rig_camera), how)
+        new, dropped = without_wrong_law(rig, {**known, **files})
+        written = _named(write_files(out, files, {options.rig: new}), known)
+        if rig_known is None:
+            echo(
+                f"rig {options.rig!r} is new: its hand is 'default-right', its frame that of {views.cameras[0]}"
+            )
+        if dropped:
+            echo(dropped)
+        return written
+
+    numbers = report_json(found) | {"rig": options.rig}
+    finish(options, report_lines(found), numbers, lambda path: draw_views(path, (fit,)), write)
+
+
+def _with_lenses(
+    views: BoardViews | Tracks,
+    known: Mapping[str, CameraCalibration | None],
+    results: Mapping[str, CamerasResult],
+    tool: str,
+    source: Path,
+) -> dict[str, CameraCalibration]:
+    """The files of cameras with the lenses that were found."""
     files: dict[str, CameraCalibration] = {}
-    for name in (name for name in views.cameras if name not in held):
-        how = lens_provenance(found, name, "calibrate cameras stereo", data)
-        lens = found.lenses[name].intrinsics
-        files[name] = camera_with_lens(known[name], name, views.sizes_px[name], lens, how)
-    how = places_provenance(found, "calibrate cameras stereo", data)
-    if options.json_file is not None:
-        write_summary(options.json_file, report_json(found) | {"rig": options.rig})
-    written, dropped = list[Path](), ""
-    if options.out is not None:
-        new, dropped = without_wrong_law(
-            rig_with_places(rig_known, options.rig, dict(found.T_rig_camera), how), {**known, **files}
+    for name, own in results.items():
+        how = lens_provenance(own, name, tool, (_source_name(source),))
+        files[name] = camera_with_lens(
+            known[name], name, views.sizes_px[name], own.lenses[name].intrinsics, how
         )
-        written = write_files(options.out, files, {options.rig: new})
-    if rig_known is None and written:
-        echo(f"rig {options.rig!r} is new: its hand is 'default-right', its frame that of {views.cameras[0]}")
-    if dropped and written:
-        echo(dropped)
-    _written(written, known)
+    return files
 
 
 def _bent(*, flat: bool, bent: bool) -> bool | None:
@@ -325,20 +340,13 @@ def _source_name(source: Path) -> str:
     return source.resolve().name
 
 
-def _named(picture: Path | None, camera: str) -> Path | None:
-    return None if picture is None else picture.with_stem(f"{picture.stem}_{camera}")
-
-
-def _draw(picture: Path | None, fit: CamerasFit) -> None:
-    if picture is None:
-        return
-    draw_views(picture, fit)
-    echo(f"drew {picture}")
-
-
-def _written(paths: list[Path], known: dict[str, CameraCalibration | None]) -> None:
-    if not paths:
-        echo("nothing written: give --out DIR")
+def _named(paths: list[Path], known: Mapping[str, CameraCalibration | None]) -> dict[Path, str]:
+    """What was written to each file."""
+    what: dict[Path, str] = {}
     for path in paths:
-        new = path.parent.name == "cameras" and known.get(path.stem) is None
-        echo(f"wrote {path}{' (new: mode, exposure and gains are neutral values)' * new}")
+        lens = path.parent.name == "cameras"
+        new = lens and known.get(path.stem) is None
+        what[path] = (
+            f"{'lens' if lens else 'places'}{' (new: mode, exposure and gains are neutral values)' * new}"
+        )
+    return what

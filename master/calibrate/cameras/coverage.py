@@ -183,17 +183,18 @@ class LiveViews:
 _BLUE, _ORANGE, _GREY = "#2b6cb0", "#c2571a", "#8a8a8a"
 
 
-def draw_views(path: Path, fit: CamerasFit) -> None:
+def draw_views(path: Path, fits: Sequence[CamerasFit]) -> None:
     """Draw one row per camera as PNG: corners, enlarged residuals, rms of each view.
 
     Raises:
         RecordingError: The file cannot be written.
     """
-    cameras = fit.views.cameras
+    cameras = [(fit, camera) for fit in fits for camera in fit.views.cameras]
     figure = figure_of((15.0, 0.6 + 3.7 * len(cameras)))
-    figure.suptitle(f"{fit.views.board}: {len(fit.shots)} images, rms {fit.rms_px:.3f} px")
+    off = rms([residual for fit in fits for residual in fit.solution.residuals])
+    figure.suptitle(f"{fits[0].views.board}: {sum(len(fit.shots) for fit in fits)} images, rms {off:.3f} px")
     axes = figure.subplots(len(cameras), 3, squeeze=False, width_ratios=(1.0, 1.0, 1.1))
-    for row, camera in zip(axes, cameras, strict=True):
+    for row, (fit, camera) in zip(axes, cameras, strict=True):
         _corners(row[0], fit, camera)
         _residuals(row[1], fit, camera)
         _bars(row[2], fit, camera)

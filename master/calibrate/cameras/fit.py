@@ -198,8 +198,9 @@ def fit_cameras(
     near = near or {}
     alone = {camera: fit_alone(views, camera, held.get(camera), near.get(camera)) for camera in views.cameras}
     links = link(views.board, views.cameras, {camera: fit.T_camera_board for camera, fit in alone.items()})
-    if all(seen.speed_px_s is None for view in views.views for seen in view.observations.values()):
-        _refuse_moved(views, alone, links)  # of frames with times, those of a moving board have a lag as well
+    moving = any(seen.speed_px_s is not None for view in views.views for seen in view.observations.values())
+    if late_sd_s > 0.0 or not moving:  # until its lag is known, a waved board is off as if cameras moved
+        _refuse_moved(views, alone, links)
     seen = Seen(views, links.corner_order)
     drawn = board_corners(views.board)
     start = Bundle(
@@ -240,22 +241,18 @@ def fit_tracks(
     """
     delay_s, near = dict.fromkeys(tracks.cameras, 0.0), dict[str, Float]()
     rounds, settled_s = 8, 1e-3
-    usual_s = 0.01  # a program that asks a camera of 30 Hz gets a frame that is up to 33 ms old
-    settled, final = False, False
-    while not final:
-        rounds -= 1
-        views, final = tracks.views(delay_s), settled or rounds < 0
-        late_sd_s = usual_s if final else 0.0
+    late_sd_s = 0.0  # of single frames, once the lags are found
+    while True:
+        views, final = tracks.views(delay_s), late_sd_s > 0.0
         fit = fit_cameras(views, held, bent=bent if final else False, near=near, late_sd_s=late_sd_s)
-        steps, near = (
-            fit.solution.bundle.delay_s,
-            dict(zip(views.cameras, fit.solution.bundle.lenses, strict=True)),
-        )
-        delay_s = {
-            name: delay_s[name] + float(step) for name, step in zip(tracks.cameras, steps, strict=True)
-        }
-        settled = np.abs(steps).max() < settled_s
-    return replace(fit, delay_s=delay_s)
+        steps = fit.solution.bundle.delay_s.tolist()
+        near = dict(zip(views.cameras, fit.solution.bundle.lenses, strict=True))
+        delay_s = {name: delay_s[name] + step for name, step in zip(tracks.cameras, steps, strict=True)}
+        if final:
+            return replace(fit, delay_s=delay_s)
+        rounds -= 1
+        if not rounds or max(map(abs, steps)) < settled_s:
+            late_sd_s = 0.01  # a program that asks a camera of 30 Hz gets a frame that is up to 33 ms old
 
 
 def _refuse_moved(views: BoardViews, alone: Mapping[str, Alone], links: Links) -> None:
@@ -276,7 +273,11 @@ def _refuse_moved(views: BoardViews, alone: Mapping[str, Alone], links: Links) -
             points[order[a]] = transform(T @ alone[a].T_camera_board[view.name], drawn)
             corners, uv = corners_seen(view.observations[b])
             off[k] = (uv - project(points[order[b][corners]], alone[b].lens)).mean(axis=0)
-        if (jump := _jump(off))[0] > 0.0:
+            if (speed := view.observations[b].speed_px_s) is not None:  # along it frames are off by their lag
+                way, usual_s = speed[corners].mean(axis=0), 0.1
+                off[k] -= way * float(way @ off[k]) / (float(way @ way) + usual_s**-2)
+        moving = any(view.observations[name].speed_px_s is not None for view in shared for name in (a, b))
+        if (jump := _jump(off, 3.0 if moving else 1.0))[0] > 0.0:
             jumps[a, b] = jump[0], shared[jump[1] - 1].name, shared[jump[1]].name
     if not jumps:
         return
@@ -289,9 +290,9 @@ def _refuse_moved(views: BoardViews, alone: Mapping[str, Alone], links: Links) -
     )
 
 
-def _jump(off: Float) -> tuple[float, int]:
+def _jump(off: Float, least_px: float) -> tuple[float, int]:
     """The jump [px] of offsets (V, 2), and the view after it; 0: they scatter only."""
-    least, sure, least_px = 3, 6.0, 1.0  # views of either place; standard deviations
+    least, sure = 3, 6.0  # views of either place; standard deviations
     best, found = np.inf, (0.0, 0)
     for k in range(least, len(off) - least + 1):
         middles = [np.median(part, axis=0) for part in (off[:k], off[k:])]

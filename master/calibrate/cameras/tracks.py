@@ -19,11 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
-from common.arrays import Float, Image
+from common.arrays import Float, Image, Int
 from common.errors import FitError, PictureError, RecordingError
-from common.recording.frame_recording import MANIFEST
+from common.recording.frame_recording import MANIFEST, FrameRow, Illumination, open_recording
 from common.recording.pictures import ENDINGS as VIDEOS
-from common.recording.pictures import VideoFrames
+from common.recording.pictures import FramePictures, VideoFrames
 from common.recording.recorded_files import read_table
 from master.calibrate.cameras.boards import Board, ImageObservation
 from master.calibrate.cameras.views import (
@@ -32,6 +32,7 @@ from master.calibrate.cameras.views import (
     BoardViews,
     Finder,
     View,
+    check_alike,
     files_by_folder,
     files_in,
     is_new,
@@ -70,8 +71,11 @@ class Track:
                 slopes.append((gap_s, (beside.corners_px - here.corners_px) / gap_s))
         if here is None:
             return None
-        if not slopes and away_s == 0.0:  # alone, but its own
-            return here
+        if not slopes:  # its own instant, or pictures that are taken seldom, of a board at rest
+            gap_s = min(
+                (abs(float(t) - float(self.t_s[k])) for t in self.t_s if t != self.t_s[k]), default=np.inf
+            )
+            return here if abs(away_s) <= (0.5 * gap_s if gap_s >= _LONGEST_GAP_S else 0.0) else None
         if not any(abs(away_s) <= 0.51 * abs(gap) and away_s * gap >= 0.0 for gap, _ in slopes):
             return None
         uv, (gap_s, speed) = here.corners_px, slopes[-1]
@@ -109,7 +113,7 @@ class Tracks:
 
         `delay_s`: by how much each camera's times lag its exposures.
         """
-        slowest = max(self.tracks, key=lambda name: float(np.median(np.diff(self.tracks[name].t_s))))
+        slowest = max(self.tracks, key=lambda name: _step_s(self.tracks[name].t_s))
         reference = self.tracks[slowest]
         views: list[tuple[float, View]] = []
         for number, t_s in zip(reference.numbers, reference.t_s - delay_s[slowest], strict=True):
@@ -138,13 +142,14 @@ def track(board: Board, streams: Mapping[str, Stream], progress: Callable[[str],
         FitError: The board is in none of the frames, or no frame of a camera can be decoded.
     """
     finder, tracks, sizes = Finder(board), dict[str, Track](), dict[str, tuple[int, int]]()
+    every = _wanted({name: stream.t_s for name, stream in streams.items()})
     for name, stream in streams.items():
-        wanted = _wanted(stream.t_s)
+        wanted = every[name]
         found, broken = list[ImageObservation | None](), ""
-        for done, i in enumerate(wanted.tolist(), 1):
+        for done, i in enumerate((int(i) for i in wanted), 1):
             try:
                 image = stream.read(stream.numbers[i])
-                sizes[name] = (image.shape[1], image.shape[0])
+                check_alike(sizes, name, str(stream.numbers[i]), image)
                 found.append(finder.find(image))
             except PictureError as error:
                 found.append(None)
@@ -154,7 +159,7 @@ def track(board: Board, streams: Mapping[str, Stream], progress: Callable[[str],
                 progress(f"{name}: {done} of {len(wanted)} frames, the board in {seen}")
         if name not in sizes:
             raise FitError(f"{stream.source}: {broken}")
-        tracks[name] = Track(tuple(stream.numbers[i] for i in wanted), stream.t_s[wanted], tuple(found))
+        tracks[name] = Track(tuple(stream.numbers[int(i)] for i in wanted), stream.t_s[wanted], tuple(found))
     if not any(one for own in tracks.values() for one in own.found):
         raise FitError(
             f"no {board} in any of {sum(len(t.found) for t in tracks.values())} frames: {finder.advice()}"
@@ -162,15 +167,32 @@ def track(board: Board, streams: Mapping[str, Stream], progress: Callable[[str],
     return Tracks(finder.board, sizes, tracks)
 
 
-def _wanted(t_s: Float) -> "np.ndarray[tuple[int], np.dtype[np.int64]]":
-    """Indices of at most 600 frames: 15 a second, of more in bursts of a second."""
-    fastest_hz, most, burst = 15.0, 600, 15
-    step = max(int(1.0 / fastest_hz / max(float(np.median(np.diff(t_s))), 1e-6) + 0.01), 1)
-    thinned = np.arange(0, len(t_s), step)
-    if len(thinned) <= most:
+def _step_s(t_s: Float) -> float:
+    """Usual time between frames [s]."""
+    return float(np.median(np.diff(t_s))) if len(t_s) > 1 else np.inf
+
+
+def _wanted(t_s: Mapping[str, Float]) -> dict[str, Int]:
+    """Indices of at most 600 frames of each camera, 15 a second.
+
+    Of more frames they are in bursts of a second. Bursts are at the same times for all cameras.
+    """
+    fastest_hz, most = 15.0, 600
+    thinned = {
+        name: np.arange(
+            0, len(t), max(int(1.0 / fastest_hz / max(_step_s(t), 1e-6) + 0.01), 1), dtype=np.int64
+        )
+        for name, t in t_s.items()
+    }
+    if max(map(len, thinned.values())) <= most:
         return thinned
-    begins = np.linspace(0, len(thinned) - burst, most // burst).astype(np.int64)
-    return thinned[np.unique(begins[:, None] + np.arange(burst))]
+    first, last = max(float(t[0]) for t in t_s.values()), min(float(t[-1]) for t in t_s.values())
+    begins = np.linspace(first, max(last - 1.0, first), round(most / fastest_hz))
+    found: dict[str, Int] = {}
+    for name, frames in thinned.items():
+        since = np.searchsorted(begins, t_s[name][frames], side="right") - 1
+        found[name] = frames[(since >= 0) & (t_s[name][frames] < begins[since] + 1.0)]
+    return found
 
 
 _CAMERA = ("cam_id", "camera", "port")
@@ -182,7 +204,7 @@ COLUMNS = "cam_id or camera; frame_time or t_s (seconds), or t_ns; and, if you l
 def streams_of(
     folder: Path, cameras: Sequence[str], notify: Callable[[str], None]
 ) -> dict[str, Stream] | None:
-    """Videos of a folder, or pictures with a table of times; None: it has neither.
+    """Frames of a recording, videos, or pictures with times; None: it has none.
 
     Args:
         cameras: Those wanted; none: all.
@@ -190,7 +212,9 @@ def streams_of(
     Raises:
         RecordingError: A video cannot be opened, the table does not fit, or a wanted camera is not there.
     """
-    if not folder.is_dir() or (folder / MANIFEST).is_file():
+    if (folder / MANIFEST).is_file():
+        return _of_recording(folder, cameras)
+    if not folder.is_dir():
         return None
     table, videos = _table_in(folder), _videos_in(folder)
     if not videos and table is None:
@@ -210,6 +234,36 @@ def streams_of(
         name: Stream(*times[name], lambda k, own=own: load_image(own[k]), str(folder / name))
         for name, own in ordered.items()
     }
+
+
+def _of_recording(folder: Path, cameras: Sequence[str]) -> dict[str, Stream]:
+    """The frames of a recording that show a board, by their time stamps."""
+    recording = open_recording(folder)
+    streams: dict[str, Stream] = {}
+    for name in cameras or tuple(recording.manifest.cameras):
+        rows = {row.seq: row for row in _showing(recording.frames_of(name))}
+        if not rows:
+            raise RecordingError(f"{folder}: camera {name!r} has no frame")
+        camera = recording.manifest.cameras[name]
+        pictures = FramePictures(folder, (camera.width_px, camera.height_px))
+        t_s = 1e-9 * np.array([row.t_ns for row in rows.values()], np.float64)
+        streams[name] = Stream(
+            tuple(rows), t_s, lambda k, rows=rows, read=pictures.read: read(rows[k].file), str(folder)
+        )
+    return streams
+
+
+def _showing(rows: Sequence[FrameRow]) -> list[FrameRow]:
+    """The frames that show a board.
+
+    Of strobed ones those with the LEDs on, which are there in the dark too, and no second frame of the same
+    moment; never those with a laser's line across the corners.
+    """
+    lit = {row.illumination for row in rows}
+    for best in (Illumination.LED, Illumination.AMBIENT):
+        if best in lit:
+            return [row for row in rows if row.illumination is best]
+    return [row for row in rows if row.illumination is Illumination.NONE]
 
 
 def _videos_in(folder: Path) -> dict[str, Path]:

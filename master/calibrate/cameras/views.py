@@ -1,6 +1,6 @@
 """A view is one board seen by several cameras at once, loaded from images.
 
-Sources: a folder of files, a folder per camera, or a recording of ours.
+Sources: a folder of files, or a folder per camera.
 """
 
 import re
@@ -13,9 +13,15 @@ import numpy as np
 
 from common.arrays import Image
 from common.errors import CalibrationError, FitError, PictureError, RecordingError
-from common.recording.frame_recording import MANIFEST, FrameRow, Illumination, open_recording
-from common.recording.pictures import FramePictures, decode_file, read_picture
-from master.calibrate.cameras.boards import Board, Charuco, Checkerboard, ImageObservation, find_board
+from common.recording.pictures import decode_file, read_picture
+from master.calibrate.cameras.boards import (
+    Board,
+    Charuco,
+    Checkerboard,
+    ImageObservation,
+    board_corners,
+    find_board,
+)
 
 ImageSet = Mapping[str, Callable[[], Image]]
 """Images taken at one time: camera -> how to load its image."""
@@ -71,12 +77,7 @@ def look(
         observations: dict[str, ImageObservation] = {}
         for camera, load in images.items():
             image = load()
-            size = (image.shape[1], image.shape[0])
-            if sizes.setdefault(camera, size) != size:
-                raise FitError(
-                    f"camera {camera!r}: view {name} is {size[0]} x {size[1]} px, the views before it"
-                    f" {sizes[camera][0]} x {sizes[camera][1]}: take all images of a camera in one mode"
-                )
+            check_alike(sizes, camera, name, image)
             if (observation := finder.find(image)) is None:
                 unseen.append(f"{name} {camera}")
             else:
@@ -89,6 +90,19 @@ def look(
     if not views:
         raise FitError(f"no {board} in any of {len(unseen)} images: {finder.advice()}")
     return BoardViews(finder.board, sizes, tuple(views), tuple(unseen))
+
+
+def check_alike(sizes: dict[str, tuple[int, int]], camera: str, name: str, image: Image) -> None:
+    """Refuse images of one camera that differ in size; `sizes` keeps the first.
+
+    A lens holds for one mode.
+    """
+    size = (image.shape[1], image.shape[0])
+    if sizes.setdefault(camera, size) != size:
+        raise FitError(
+            f"camera {camera!r}: view {name} is {size[0]} x {size[1]} px, the views before it"
+            f" {sizes[camera][0]} x {sizes[camera][1]}: take all images of a camera in one mode"
+        )
 
 
 class Finder:
@@ -125,9 +139,13 @@ class Finder:
             return "the pictures are mirrored, as a webcam shows them to its user: turn that off"
         likely = list(_likely_mistakes(self.board))
         likely += [other for board in likely if isinstance(board, Charuco) for other in board.layouts()]
-        for other in likely:
-            if any(find_board(other, image) is not None for image in self._without):
-                return f"they show a {other}"
+        best, shown = 0.0, ""
+        for other in likely:  # of a larger one with the same markers, a part would be seen
+            seen = [found.seen for image in self._without if (found := find_board(other, image)) is not None]
+            if (share := max(seen, default=0) / len(board_corners(other))) > best:
+                best, shown = share, f"they show a {other}"
+        if shown:
+            return shown
         if isinstance(self.board, Checkerboard):
             return (
                 "count the inner corners (squares less one), show all with a white margin, well lit and sharp"
@@ -170,7 +188,7 @@ def _likely_mistakes(board: Board) -> Iterator[Board]:
             if min(columns, rows) >= 3:
                 yield Checkerboard(columns, rows, board.square_m)
         return
-    grids = [(r, c), (c + 1, r + 1), (c - 1, r - 1)]
+    grids = [(r, c), (c + 1, r + 1), (c - 1, r - 1), (c + 1, r), (c - 1, r)]
     others = [(columns, rows, board.dictionary) for columns, rows in grids if (columns, rows) != (c, r)]
     others += [(c, r, f"{bits}_1000") for bits in ("4X4", "5X5", "6X6", "7X7")]
     for columns, rows, dictionary in others:
@@ -189,8 +207,8 @@ def image_sets(folder: Path, cameras: Sequence[str] = ()) -> list[tuple[str, Ima
     """The views of a folder by name: images of all cameras taken at one epoch.
 
     Args:
-        folder: Holds `recording.json`; or one sub-folder of images per camera, views matched by file name; or
-            images named CAMERA*.png|jpg|…, matched by the rest of the name (left01.jpg, right01.jpg).
+        folder: Holds one sub-folder of images per camera, views matched by file name; or images named
+            CAMERA*.png|jpg|…, matched by the rest of the name (left01.jpg, right01.jpg).
         cameras: Those wanted; none: those the folder has, a name being what stands before the number.
 
     Raises:
@@ -198,8 +216,6 @@ def image_sets(folder: Path, cameras: Sequence[str] = ()) -> list[tuple[str, Ima
     """
     if not folder.is_dir():
         raise RecordingError(f"{folder}: is not a folder")
-    if (folder / MANIFEST).is_file():
-        return _of_recording(folder, cameras)
     files = files_in(folder, ENDINGS)
     if files:
         return _matched(folder, _by_prefix(folder, files, cameras))
@@ -279,46 +295,3 @@ def load_image(file: Path, *, grey: bool = False) -> Image:
         raise RecordingError(f"{file}: cannot read: {error.strerror}") from error
     except PictureError as error:
         raise RecordingError(f"{file}: is no image: it {error}") from error
-
-
-def _showing(rows: Sequence[FrameRow]) -> list[FrameRow]:
-    """The frames that show a board.
-
-    Of strobed ones those with the LEDs on, which are there in the dark too, and no second frame of the same
-    moment; never those with a laser's line across the corners.
-    """
-    lit = {row.illumination for row in rows}
-    for best in (Illumination.LED, Illumination.AMBIENT):
-        if best in lit:
-            return [row for row in rows if row.illumination is best]
-    return [row for row in rows if row.illumination is Illumination.NONE]
-
-
-def _of_recording(folder: Path, cameras: Sequence[str]) -> list[tuple[str, ImageSet]]:
-    """Views spread evenly: frames of the first camera, and the others' nearest."""
-    recording = open_recording(folder)
-    names = list(cameras) or list(recording.manifest.cameras)
-    rows = {name: _showing(recording.frames_of(name)) for name in names}
-    pictures: dict[str, FramePictures] = {}
-    for name, own in rows.items():
-        if not own:
-            raise RecordingError(f"{folder}: camera {name!r} has no frame")
-        camera = recording.manifest.cameras[name]
-        pictures[name] = FramePictures(folder, (camera.width_px, camera.height_px))
-    reference = rows[names[0]]
-    times = {name: np.array([row.t_ns for row in own], dtype=np.int64) for name, own in rows.items()}
-    # Nearer to this frame than to its neighbours; frames alone in the recording have no neighbour to be nearer to.
-    gap = np.median(np.diff(times[names[0]])) / 2 if len(reference) > 1 else np.inf
-    chosen = np.unique(
-        np.linspace(0, len(reference) - 1, min(MOST_VIEWS, len(reference))).round().astype(int)
-    )
-    sets: list[tuple[str, ImageSet]] = []
-    for i in chosen:
-        row = reference[int(i)]
-        images: dict[str, Callable[[], Image]] = {}
-        for name, own in rows.items():
-            nearest = int(np.abs(times[name] - row.t_ns).argmin())
-            if abs(own[nearest].t_ns - row.t_ns) <= gap:
-                images[name] = partial(pictures[name].read, own[nearest].file)
-        sets.append((str(row.seq), images))
-    return sets

@@ -11,7 +11,7 @@ from common.errors import RecordingError
 from common.geometry.transforms import axis_rotation, rigid
 from common.recording.frame_recording import FRAMES, MANIFEST
 from master.calibrate.cameras.coverage import advice, advice_so_far, coverage
-from master.calibrate.cameras.views import MOST_VIEWS, image_sets
+from master.calibrate.cameras.tracks import streams_of
 from tests.master.calibrate.cameras.board_scenes import SIZE, scene
 
 MIDDLE = np.array([0.1, 0.06, 0.0])
@@ -64,10 +64,10 @@ def test_frames_of_a_recording_nearest_in_time_make_a_view(tmp_path: Path, datas
             cv2.imwrite(str(tmp_path / file), np.full((480, 640), i, np.uint8))
             rows.append(f"{camera},{i},{i * 16_666_667 + late_ns},none,{file}")
     (tmp_path / FRAMES).write_text("\n".join(rows) + "\n")
-    sets = image_sets(tmp_path, ["left", "right"])
-    assert len(sets) == MOST_VIEWS
-    assert list(sets[0][1]) == ["left"]
-    for _, images in sets[1:]:
-        assert images["left"]()[0, 0, 0] == images["right"]()[0, 0, 0]
+    streams = streams_of(tmp_path, ["left", "right"], print)
+    assert streams is not None
+    assert [len(stream.numbers) for stream in streams.values()] == [100, 99]
+    assert streams["right"].read(7)[0, 0, 0] == 7
+    np.testing.assert_allclose(streams["right"].t_s[6] - streams["left"].t_s[7], 0.003, atol=1e-9)
     with pytest.raises(RecordingError, match="no camera 'top'"):
-        image_sets(tmp_path, ["left", "top"])
+        streams_of(tmp_path, ["left", "top"], print)
