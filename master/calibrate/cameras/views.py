@@ -140,10 +140,10 @@ class Finder:
         likely = list(_likely_mistakes(self.board))
         likely += [other for board in likely if isinstance(board, Charuco) for other in board.layouts()]
         best, shown = 0.0, ""
-        for other in likely:  # of a larger one with the same markers, a part would be seen
+        for other in likely:  # of a larger one a part would be seen, of a smaller one less
             seen = [found.seen for image in self._without if (found := find_board(other, image)) is not None]
-            if (share := max(seen, default=0) / len(board_corners(other))) > best:
-                best, shown = share, f"they show a {other}"
+            if (score := max(seen, default=0) ** 2 / len(board_corners(other))) > best:
+                best, shown = score, f"they show a {other}"
         if shown:
             return shown
         if isinstance(self.board, Checkerboard):

@@ -109,7 +109,7 @@ def test_a_camera_that_moves_while_the_board_is_waved_is_refused(moves: bool) ->
             inside = bool(((uv > 4) & (uv < np.array(SIZE) - 5)).all())
             found.append(ImageObservation(uv, 0.9) if inside else None)
             if moves and inside and camera == "right" and k >= 70:
-                found[-1] = ImageObservation(uv + [6.0, 3.0], 0.9)
+                found[-1] = ImageObservation(uv + np.array([6.0, 3.0]), 0.9)
         tracks[camera] = Track(tuple(range(frames)), stamps(camera, frames), tuple(found))
     both = Tracks(BOARD, dict.fromkeys(tracks, SIZE), tracks)
     if not moves:
