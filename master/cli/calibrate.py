@@ -27,7 +27,7 @@ from master.commands.options import (
 
 def add_board(command: ArgumentParser, size: str | None = None, square_mm: float | None = None) -> None:
     """The board; without a usual size and square they have to be given."""
-    shape = "inner corners of a checkerboard, squares of a ChArUco board (--marker-mm)"
+    shape = "inner corners of a checkerboard, squares of a ChArUco board (--marker-mm), circles (--circle-mm)"
     add_text(command, "--board", "COLUMNSxROWS", shape, required=size is None, default=size)
     side, given = "side of a square, measured on the print", square_mm is not None
     add_number(command, "--square-mm", "MM", side, required=not given, default=square_mm)
@@ -35,8 +35,11 @@ def add_board(command: ArgumentParser, size: str | None = None, square_mm: float
 
 
 def add_markers_of_board(command: ArgumentParser) -> None:
-    """The markers of a ChArUco board."""
+    """The markers of a ChArUco board, or the circles of a grid."""
     add_number(command, "--marker-mm", "MM", "side of a marker: the board is a ChArUco board")
+    add_number(
+        command, "--circle-mm", "MM", "diameter of a circle: a grid of circles, a square is their distance"
+    )
     add_dictionary(command)
 
 

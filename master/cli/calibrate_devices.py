@@ -54,7 +54,7 @@ def laser_plane(command: ArgumentParser) -> None:
         "alone, if it shows the board too; or a point cloud in the camera frame, .ply, .csv, .xyz, .txt"
     )
     add_path(command, "source", "SOURCE", text)
-    shape = "of pictures: inner corners of a checkerboard, squares of a ChArUco board (--marker-mm)"
+    shape = "of pictures: inner corners of a checkerboard, squares of a ChArUco board (--marker-mm), circles"
     add_text(command, "--board", "COLUMNSxROWS", shape)
     add_number(command, "--square-mm", "MM", "of pictures: side of a square, measured on the print")
     add_markers_of_board(command)

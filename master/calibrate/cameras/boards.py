@@ -102,14 +102,37 @@ class Charuco:
                 yield replace(self, old_layout=old, inverted=inverted)
 
 
-Board = Checkerboard | Charuco
+@dataclass(frozen=True, slots=True)
+class CircleGrid:
+    """Dark circles on white paper in straight rows; their centres are its corners."""
+
+    columns: int  # this and rows: circles along x and y, at least 3
+    rows: int
+    square_m: float  # from centre to centre [m]
+    circle_m: float  # diameter [m]
+
+    def __post_init__(self) -> None:
+        if min(self.columns, self.rows) < 3:
+            raise CalibrationError(f"{self}: a grid needs at least 3 x 3 circles")
+        _check_length(self, "distance of centres", self.square_m)
+        if not 0.0 < self.circle_m < self.square_m:
+            raise CalibrationError(f"{self}: circles must be smaller than the distance of their centres")
+
+    def __str__(self) -> str:
+        return (
+            f"grid of {self.columns} x {self.rows} circles of {self.circle_m * 1e3:g} mm,"
+            f" {self.square_m * 1e3:g} mm from centre to centre"
+        )
+
+
+Board = Checkerboard | Charuco | CircleGrid
 
 
 def grid_shape(board: Board) -> tuple[int, int]:
     """Rows and columns of the inner corners."""
-    if isinstance(board, Checkerboard):
-        return board.rows, board.columns
-    return board.rows - 1, board.columns - 1
+    if isinstance(board, Charuco):
+        return board.rows - 1, board.columns - 1
+    return board.rows, board.columns
 
 
 def board_corners(board: Board) -> Float:
@@ -132,18 +155,18 @@ def orderings(board: Board) -> tuple[Int, ...]:
     """Rotations of the pattern that look the same, the unrotated one first.
 
     As orders (N,) of corner numbers. A ChArUco board has one. A checkerboard with an odd sum of columns and
-    rows has one too, because its colours distinguish its ends; others look the same after half a turn, square
-    ones also after a quarter.
+    rows has one too, because its colours distinguish its ends; others, and all grids of circles, look the same
+    after half a turn, square ones also after a quarter.
     """
     rows, columns = grid_shape(board)
     n = np.arange(rows * columns).reshape(rows, columns)
     if isinstance(board, Charuco):
         return (n.ravel(),)
     # Square (0, 0) keeps its colour if the sum of its indices stays even: after half a turn it is (rows-2, cols-2).
-    found = [n]
-    if (rows + columns) % 2 == 0:
+    found, circles = [n], isinstance(board, CircleGrid)
+    if circles or (rows + columns) % 2 == 0:
         found.append(np.rot90(n, 2))
-    if rows == columns and columns % 2 == 0:
+    if rows == columns and (circles or columns % 2 == 0):
         found += [np.rot90(n, 1), np.rot90(n, 3)]
     return tuple(rotated.ravel() for rotated in found)
 
@@ -154,7 +177,9 @@ def _check_length(board: object, what: str, length_m: float) -> None:
         raise CalibrationError(f"{board}: the {what} must be between 0.5 mm and 1 m (give it in mm)")
 
 
-def board_of(size: str, square_mm: float, marker_mm: float | None, dictionary: str) -> Board:
+def board_of(
+    size: str, square_mm: float, marker_mm: float | None, dictionary: str, circle_mm: float | None = None
+) -> Board:
     """The board that the options name.
 
     Raises:
@@ -164,6 +189,10 @@ def board_of(size: str, square_mm: float, marker_mm: float | None, dictionary: s
     if found is None:
         raise CalibrationError(f"--board {size!r}: expected COLUMNSxROWS, for example 9x6")
     columns, rows = int(found[1]), int(found[2])
+    if circle_mm is not None:
+        if marker_mm is not None:
+            raise CalibrationError("--circle-mm: a grid of circles has no markers, leave --marker-mm out")
+        return CircleGrid(columns, rows, square_mm * 1e-3, circle_mm * 1e-3)
     if marker_mm is None:
         return Checkerboard(columns, rows, square_mm * 1e-3)
     return Charuco(columns, rows, square_mm * 1e-3, marker_mm * 1e-3, dictionary)
@@ -171,7 +200,8 @@ def board_of(size: str, square_mm: float, marker_mm: float | None, dictionary: s
 
 def board_in(options: Namespace) -> Board:
     """The board that a command's options name."""
-    return board_of(options.board, options.square_mm, options.marker_mm, options.dictionary)
+    size, square_mm, marker_mm = options.board, options.square_mm, options.marker_mm
+    return board_of(size, square_mm, marker_mm, options.dictionary, options.circle_mm)
 
 
 def options_of(board: Board) -> str:
@@ -179,7 +209,7 @@ def options_of(board: Board) -> str:
     text = f"--board {board.columns}x{board.rows} --square-mm {1e3 * board.square_m:g}"
     if isinstance(board, Charuco):
         text += f" --marker-mm {1e3 * board.marker_m:g} --dictionary {board.dictionary}"
-    return text
+    return text + (f" --circle-mm {1e3 * board.circle_m:g}" if isinstance(board, CircleGrid) else "")
 
 
 _WINDOW_PX = (3, 15)  # smaller ones hold too little of the edges: five times the error
@@ -209,10 +239,13 @@ def find_board(board: Board, image: Image) -> ImageObservation | None:
     None where it is not found whole (ChArUco: 8 corners of it).
     """
     grey = image if image.ndim == 2 else cast(Image, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
-    corners = _charuco(board, grey) if isinstance(board, Charuco) else _checkerboard(board, grey)
+    if isinstance(board, CircleGrid):
+        corners = _circles(board, grey)
+    else:
+        corners = _charuco(board, grey) if isinstance(board, Charuco) else _checkerboard(board, grey)
+        corners = None if corners is None else _refine(board, grey, corners)
     if corners is None:
         return None
-    corners = _refine(board, grey, corners)
     if np.isfinite(corners[:, 0]).sum() < 8:  # a pose and a few corners to check it
         return None
     return ImageObservation(corners, _blur(board, grey, corners))
@@ -231,13 +264,37 @@ def _checkerboard(board: Checkerboard, grey: Image) -> Float | None:
     return _upright(board, grey, np.asarray(corners, dtype=np.float64).reshape(-1, 2))
 
 
+def _circles(board: CircleGrid, grey: Image) -> Float | None:
+    """Images of the circles' centres, which are not the centres of their images.
+
+    The image of a circle of radius r at x is an ellipse, whose dual conic is H C H^T, with that of the circle, C
+    (Hartley and Zisserman, Multiple view geometry, section 8.5); H is from the grid to the image.
+    """
+    how, most = cv2.SimpleBlobDetector.Params(), grey.size / (board.columns * board.rows)
+    how.minArea, how.maxArea, how.minDistBetweenBlobs = 20.0, float(most), 4.0
+    size, detector = (board.columns, board.rows), cv2.SimpleBlobDetector.create(how)
+    found, seen = cv2.findCirclesGrid(grey, size, flags=cv2.CALIB_CB_SYMMETRIC_GRID, blobDetector=detector)
+    if not found:
+        return None
+    corners = _not_mirrored(board, np.asarray(seen, dtype=np.float64).reshape(-1, 2)).reshape(-1, 2)
+    drawn = board_corners(board)
+    H = np.asarray(cv2.findHomography(drawn[:, :2], corners)[0], np.float64)
+    centre = np.append(drawn[:, :2], np.ones((len(drawn), 1)), axis=1) @ H.T
+    spread = (0.5 * board.circle_m) ** 2 * (H[:, :2] @ H[:, :2].T)
+    ellipse = (spread[2] - centre * centre[:, 2:]) / (spread[2, 2] - centre[:, 2:] ** 2)
+    return corners - (ellipse - centre / centre[:, 2:])[:, :2]
+
+
+def _not_mirrored(board: Board, corners: Float) -> Float:
+    """Corners as (rows, columns, 2), with the columns in the order that a camera sees."""
+    grid = corners.reshape(*grid_shape(board), 2)
+    along, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+    return grid[:, ::-1] if along[0] * down[1] - along[1] * down[0] < 0.0 else grid
+
+
 def _upright(board: Checkerboard, grey: Image, corners: Float) -> Float:
     """The corners in the board's order: not mirrored, square (0, 0) dark if a choice."""
-    rows, columns = grid_shape(board)
-    grid = corners.reshape(rows, columns, 2)
-    along, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
-    if along[0] * down[1] - along[1] * down[0] < 0.0:
-        grid = grid[:, ::-1]
+    (rows, columns), grid = grid_shape(board), _not_mirrored(board, corners)
     middles = (grid[:-1, :-1] + grid[:-1, 1:] + grid[1:, :-1] + grid[1:, 1:]) / 4.0
     light = _sample(grey, middles)
     even = np.add.outer(np.arange(rows - 1), np.arange(columns - 1)) % 2 == 0
@@ -347,7 +404,7 @@ def _blur(board: Board, grey: Image, corners: Float) -> float:
     edges = grid_edges(board)
     split = rows * (columns - 1)
     # Up to the middle of a square; beside a marker only its white margin is free.
-    reach = 0.35 if isinstance(board, Checkerboard) else 0.4 * (1.0 - board.marker_m / board.square_m)
+    reach = 0.4 * (1.0 - board.marker_m / board.square_m) if isinstance(board, Charuco) else 0.35
     steps = np.linspace(-reach, reach, 29)
     worst = 0.0
     for family in (edges[:split], edges[split:]):
@@ -359,6 +416,8 @@ def _blur(board: Board, grey: Image, corners: Float) -> float:
         a, b, length = a[known], b[known], length[known, None]
         across = (b - a)[:, ::-1] * [1.0, -1.0] / length
         points = ((a + b) / 2)[:, None] + across[:, None] * (length * steps)[..., None]
+        if isinstance(board, CircleGrid):  # from the centre to the paper
+            points = a[:, None] + (b - a)[:, None] * (steps + reach)[:, None]
         profile = _sample(grey, points)
         rise = np.abs(profile[:, -4:].mean(axis=1) - profile[:, :4].mean(axis=1))
         slope = np.abs(np.diff(profile, axis=1)).max(axis=1) / (length[:, 0] * (steps[1] - steps[0]))

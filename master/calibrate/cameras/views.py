@@ -5,7 +5,7 @@ Sources: a folder of files, or a folder per camera.
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -146,10 +146,9 @@ class Finder:
                 best, shown = score, f"they show a {other}"
         if shown:
             return shown
-        if isinstance(self.board, Checkerboard):
-            return (
-                "count the inner corners (squares less one), show all with a white margin, well lit and sharp"
-            )
+        if not isinstance(self.board, Charuco):
+            what = "inner corners (squares less one)" if isinstance(self.board, Checkerboard) else "circles"
+            return f"count the {what}, show all with a white margin, well lit and sharp"
         return "check columns, rows, sizes and dictionary against what is printed on the board, light and sharpness"
 
 
@@ -181,12 +180,12 @@ def is_new(
 def _likely_mistakes(board: Board) -> Iterator[Board]:
     """Boards that a user may mean: squares counted, sides swapped, other family."""
     c, r = board.columns, board.rows
-    if isinstance(board, Checkerboard):
+    if not isinstance(board, Charuco):
         # The larger first: a part of a board can be taken for a smaller one.
         sizes = ((c + 1, r + 1), (c, r + 1), (c + 1, r), (c, r - 1), (c - 1, r), (c - 1, r - 1))
         for columns, rows in sizes:
             if min(columns, rows) >= 3:
-                yield Checkerboard(columns, rows, board.square_m)
+                yield replace(board, columns=columns, rows=rows)
         return
     grids = [(r, c), (c + 1, r + 1), (c - 1, r - 1), (c + 1, r), (c - 1, r)]
     others = [(columns, rows, board.dictionary) for columns, rows in grids if (columns, rows) != (c, r)]

@@ -89,15 +89,19 @@ class LitView:
 
     # how the view is called in reports: the number of its first frame, or what its files have in common
     name: str
-    frames: Mapping[Illumination, Callable[[], Image]]  # what lit it -> how to load the frame (H, W), 8 bits
+    # what lit it -> how to load the frame (H, W) or (H, W, 3) BGR, 8 bits
+    frames: Mapping[Illumination, Callable[[], Image]]
 
-    def load(self, lit: Illumination) -> Image | None:
+    def load(self, lit: Illumination, *, colour: bool = False) -> Image | None:
         """One of its frames; None where there is none of this kind.
 
         Raises:
             RecordingError: The file cannot be read, or is no image.
         """
-        return self.frames[lit]() if lit in self.frames else None
+        image = self.frames[lit]() if lit in self.frames else None
+        if image is None or image.ndim == 2 or colour:
+            return image
+        return cast(Image, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
 
 
 def lit_views(folder: Path, camera: str, needed: Illumination) -> tuple[LitView, ...]:
@@ -146,7 +150,7 @@ def _recorded(folder: Path, camera: str) -> list[LitView]:
             if near.illumination is first or near.seq - row.seq > apart:
                 break
             cycle.setdefault(near.illumination, near)
-        frames = {lit: partial(load_grey, folder / one.file) for lit, one in cycle.items()}
+        frames = {lit: partial(load_image, folder / one.file) for lit, one in cycle.items()}
         views.append(LitView(str(row.seq), frames))
     return views
 
@@ -158,7 +162,7 @@ def _named(folder: Path) -> list[LitView]:
         if match is not None and file.suffix.lower() in ENDINGS:
             lit = match[2].lower()
             lit = Illumination.LED if lit == "board" else Illumination(lit)
-            found.setdefault(match[1], {})[lit] = partial(load_grey, file)
+            found.setdefault(match[1], {})[lit] = partial(load_image, file)
     return [LitView(name or "0", frames) for name, frames in found.items()]
 
 
@@ -176,9 +180,6 @@ def grouped_by_reason(refused: Mapping[str, str]) -> list[str]:
         more = f" and {len(names) - most_named} more" if len(names) > most_named else ""
         lines.append(f"view{'s'[: len(names) > 1]} {', '.join(names[:most_named])}{more}: {reason}")
     return lines
-
-
-load_grey = partial(load_image, grey=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,12 +222,13 @@ def board_corners_of(view: LitView, board: Board, optics: CameraModel) -> Float:
                 f"its image is {image.shape[1]} x {image.shape[0]} px,"
                 f" the camera {optics.width_px} x {optics.height_px}"
             )
-        if lit is Illumination.LASER:
-            # A line is thinner than this; a corner looks the same turned by 180 deg, so that its place stays.
-            line_px = 7
-            image = cast(Image, cv2.morphologyEx(image, cv2.MORPH_OPEN, np.ones((line_px, line_px))))
-        if (observation := find_board(board, image)) is not None:
-            seen.append(observation.corners_px)
+        # A line is thinner than this, but small squares may be, too; a corner looks the same turned by 180 deg, so
+        # that its place stays.
+        for line_px in (7, 5, 3) if lit is Illumination.LASER else (1,):
+            opened = cast(Image, cv2.morphologyEx(image, cv2.MORPH_OPEN, np.ones((line_px, line_px))))
+            if (observation := find_board(board, opened)) is not None:
+                seen.append(observation.corners_px)
+                break
     if not seen:
         raise FitError("no board found: show all of it with its white margin, sharp and not too bright")
     # The ambient frame comes before the laser's and the LED's after it: their mean is where the board was between.

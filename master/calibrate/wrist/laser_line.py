@@ -18,7 +18,7 @@ from common.arrays import Bool, Float, Image, Int
 from common.errors import FitError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import transform
-from master.calibrate.cameras.boards import Board, grid_shape
+from master.calibrate.cameras.boards import Board, CircleGrid, grid_shape
 from master.calibrate.wrist.device import BoardPose
 
 Grey = npt.NDArray[np.float32]
@@ -41,7 +41,7 @@ class BoardLine:
 def line_on_board(
     laser: Image, ambient: Image | None, placed: BoardPose, board: Board, optics: CameraModel
 ) -> BoardLine:
-    """Points of the laser's line on the board, from frames (H, W).
+    """Points of the laser's line on the board, from frames (H, W) or (H, W, 3).
 
     Without an ambient frame the board may be lit in the laser's own.
 
@@ -50,6 +50,8 @@ def line_on_board(
     """
     image = np.asarray(laser, np.float32) - (0.0 if ambient is None else np.asarray(ambient, np.float32))
     pixel_m = float(placed.centre_m[2]) / float(np.sqrt(optics.matrix[0, 0] * optics.matrix[1, 1]))
+    if image.ndim == 3:  # all colours alike: a grey picture hardly has the light of a blue laser
+        image = image.mean(axis=2)
     light = _BoardLight(image, placed.T_camera_board, board, optics)
     at, texel_m = _texels(board, pixel_m)
     if ambient is None:
@@ -64,8 +66,10 @@ def line_on_board(
     background = float(np.median(flat))
     noise = 1.4826 * float(np.median(np.abs(flat - background))) + 0.5
     point, along = _brightest_line(flat - background, at, noise, 1.5 * texel_m)
-    coarse = _profiles(light, point, along, pixel_m, noise, placed, board)
-    found = _profiles(light, coarse.point, coarse.along, pixel_m, noise, placed, board)
+    # Of a profile to both sides: beyond the light of a broad line as well.
+    reach_px = max(8.0, 4.0 * _half_width_px(flat - background, at, point, along, pixel_m))
+    coarse = _profiles(light, point, along, pixel_m, noise, placed, reach_px)
+    found = _profiles(light, coarse.point, coarse.along, pixel_m, noise, placed, reach_px)
     return BoardLine(found.points_m, optics.project(found.points_m), found.sigma_px, found.rms_px)
 
 
@@ -108,7 +112,9 @@ class _BoardLight:
         cell = np.floor(xy / side).astype(np.int64)
         within = xy / side - cell - 0.5
         rows, columns = grid_shape(self.board)
-        clear = (0.5 - np.abs(within)).min(axis=-1) * side > self.border_m
+        clear = _from_border_m(self.board, xy) > self.border_m
+        if isinstance(self.board, CircleGrid):  # paper alone
+            clear &= np.hypot(*np.moveaxis(0.5 - np.abs(within), -1, 0)) > 0.5 * self.board.circle_m / side
         clear &= ((cell >= -1) & (cell < [columns, rows])).all(axis=-1)
         cell = np.clip(cell + 1, 0, [columns, rows])
         return cell, np.concatenate([np.ones_like(within[..., :1]), within], axis=-1), clear
@@ -139,6 +145,14 @@ class _BoardLight:
         )
         squares[printed] = np.nan
         return replace(near, squares=squares)
+
+
+def _from_border_m(board: Board, xy: Float) -> Float:
+    """Distance (...) of places (..., 2) [m] from the nearest border of the print."""
+    off = np.abs(xy / board.square_m - np.rint(xy / board.square_m)) * board.square_m
+    if isinstance(board, CircleGrid):
+        return np.abs(np.hypot(off[..., 0], off[..., 1]) - 0.5 * board.circle_m)
+    return off.min(axis=-1)
 
 
 def _level_plane(terms: Float, values: Float) -> tuple[Float, float]:
@@ -176,6 +190,18 @@ def _brightest_line(values: Float, at: Float, noise: float, within_m: float) -> 
     return middle, np.linalg.svd(spread, full_matrices=False)[2][0]
 
 
+def _half_width_px(values: Float, at: Float, point: Float, along: Float, pixel_m: float) -> float:
+    """How far from a line its light falls to a half, from levels (n,) at places (n, 2)."""
+    most_px = 40
+    off = np.abs((at - point) @ [-along[1], along[0]]) / pixel_m
+    near = off < most_px
+    bins = off[near].astype(np.int64)
+    count = np.maximum(np.bincount(bins, minlength=most_px), 1)
+    mean = np.bincount(bins, values[near], most_px) / count
+    low = mean < 0.5 * mean[0]
+    return float(np.argmax(low)) if low.any() else float(most_px)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Centred:
     """Line on the board: point and direction (2,), points (n, 3) [m], uncertainty."""
@@ -194,9 +220,10 @@ def _profiles(
     pixel_m: float,
     noise: float,
     placed: BoardPose,
-    board: Board,
+    reach_px: float,
 ) -> _Centred:
     """Centre the line in profiles a pixel apart, and fit a straight line to that."""
+    board = light.board
     rows, columns = grid_shape(board)
     side = board.square_m
     across = np.array([-along[1], along[0]])
@@ -204,15 +231,16 @@ def _profiles(
     s = np.arange(-reach, reach, pixel_m)
     base = point + s[:, None] * along
     inside = ((base > -side) & (base < np.array([columns, rows]) * side)).all(axis=1)
-    # Distance from the nearest border of squares, in both directions of the board.
-    from_border = np.abs(base / side - np.rint(base / side)).min(axis=1) * side
+    from_border = _from_border_m(board, base)
     border_px = 3.0  # kept from the borders of squares ...
     border = 0.3  # ... but never more of a square than this
     clear = from_border > min(border_px * pixel_m, border * side)
     s, base = s[inside & clear], base[inside & clear]
-    if len(s) < _MIN_PROFILES:  # such as a line along the border of two rows
-        raise FitError(_TOO_SHORT)
-    reach_px = 8.0  # of a profile to both sides
+    if 2 * len(s) < inside.sum() or len(s) < _MIN_PROFILES:
+        raise FitError(
+            "the laser line runs along the border of two rows of squares, where the paper and not the light makes"
+            " its shape: shift the board, or turn it, so that the line crosses the squares"
+        )
     step_px = 0.25
     d = np.arange(-reach_px, reach_px + 0.5 * step_px, step_px)
     places = base[:, None] + (d[:, None] * pixel_m) * across

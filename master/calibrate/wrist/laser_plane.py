@@ -271,14 +271,16 @@ def _tangents(normal: Float) -> Float:
 
 def _refuse_unsure(fit: PlaneFit, points: Float) -> None:
     """Refuse points on one line, and a plane that is too uncertain."""
-    if fit.normal_sigma_rad <= NORMAL_LIMIT_RAD and fit.offset_sigma_m <= _OFFSET_LIMIT_M:
+    # Of a plane that is measured far away less is known at the camera, and no more is needed.
+    limit_m = max(_OFFSET_LIMIT_M, 5e-4 * float(points[:, 2].mean()))
+    if fit.normal_sigma_rad <= NORMAL_LIMIT_RAD and fit.offset_sigma_m <= limit_m:
         return
     wide = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
     if wide[1] < max(5.0 * fit.rms_m, 0.1 * wide[0]):
         raise FitError(_collinear(wide[1]))
     raise FitError(
         f"the plane is known to {np.degrees(fit.normal_sigma_rad):.2f} deg and {1e3 * fit.offset_sigma_m:.2f} mm only"
-        f" (limits {np.degrees(NORMAL_LIMIT_RAD):.1f} deg, {1e3 * _OFFSET_LIMIT_M:.1f} mm): show the board in more"
+        f" (limits {np.degrees(NORMAL_LIMIT_RAD):.1f} deg, {1e3 * limit_m:.1f} mm): show the board in more"
         " views, nearer and farther, so large that it fills a third of the image"
     )
 
@@ -367,7 +369,7 @@ def lines_of(views: tuple[LitView, ...], board: Board, optics: CameraModel) -> L
 
 def _line_of(view: LitView, board: Board, optics: CameraModel) -> tuple[BoardPose, BoardLine]:
     """The board of a view, and the laser's line on it."""
-    laser, ambient = view.load(Illumination.LASER), view.load(Illumination.AMBIENT)
+    laser, ambient = view.load(Illumination.LASER, colour=True), view.load(Illumination.AMBIENT, colour=True)
     assert laser is not None  # `lit_views` gives whole ones
     if ambient is not None and laser.shape != ambient.shape:
         raise FitError("its frames differ in size")

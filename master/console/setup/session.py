@@ -374,7 +374,7 @@ class Session:
         return (self.tree / WORK / f"{name}-{date}").resolve()
 
 
-_OF_BOARD = ("board", "square_mm", "marker_mm", "dictionary")
+_OF_BOARD = ("board", "square_mm", "marker_mm", "dictionary", "circle_mm")
 
 
 @functools.cache

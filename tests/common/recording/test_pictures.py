@@ -20,7 +20,6 @@ from common.messages.picture_size import MAX_SCANS, MAX_SIDE_PX, jpeg_size, size
 from common.recording.pictures import decode as picture
 from common.recording.pictures import decode_file, read_picture
 from master.calibrate.cameras.views import image_sets
-from master.calibrate.wrist.device import load_grey
 from slave.cameras.replay import read_png
 from tests.picture_helpers import TINY, claiming, hostile, many_scans, tiled
 
@@ -136,7 +135,6 @@ def test_changed_bytes_never_give_another_size_or_another_error(
 READERS: dict[str, Callable[[Path], object]] = {
     "any": read_picture,
     "frame": lambda path: read_png(path, (480, 640)),
-    "grey file": load_grey,
     "file": lambda path: [load() for _, one in image_sets(path.parent, ["left"]) for load in one.values()],
 }
 
@@ -150,7 +148,7 @@ def test_a_file_that_claims_a_terabyte_is_not_read(reader: str, tmp_path: Path) 
         READERS[reader](path)
 
 
-@pytest.mark.parametrize("reader", ["any", "frame", "grey file"])
+@pytest.mark.parametrize("reader", ["any", "frame"])
 def test_a_pipe_is_no_picture_and_is_not_waited_for(reader: str, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "left.png")
     with pytest.raises(PhalanxError, match="is no plain file"):
@@ -211,7 +209,6 @@ from common.messages import decode
 from common.messages.picture_size import size_of
 from common.recording.pictures import decode as picture, decode_file
 from master.calibrate.cameras.views import load_image
-from master.calibrate.wrist.device import load_grey
 from slave.cameras.grey import Pixels
 from slave.cameras.replay import read_png
 from slave.cameras.v4l2_formats import Layout
@@ -221,7 +218,6 @@ ways = {
     "usb grey": lambda path: Layout(Pixels.LUMA, "MJPG", (640, 480), 0).image(memoryview(path.read_bytes())),
     "recording": lambda path: read_png(path, (480, 640)),
     "file": load_image,
-    "grey file": load_grey,
     "unguarded": lambda path: cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR),
 }
 def peak_mb():  # of this program alone: ru_maxrss is also that of the process that was forked to start it
@@ -236,8 +232,8 @@ for way, path in zip(sys.argv[1::2], map(Path, sys.argv[2::2])):
         pass
     print(peak_mb() - before_mb, time.process_time() - before_s)
 """
-JPEG_WAYS = ("device", "usb", "usb grey", "recording", "file", "grey file")
-TIFF_WAYS = ("device", "recording", "file", "grey file")
+JPEG_WAYS = ("device", "usb", "usb grey", "recording", "file")
+TIFF_WAYS = ("device", "recording", "file")
 
 
 def test_bytes_that_claim_gigabytes_cost_nothing_but_where_nothing_guards(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from common.arrays import Float, Image
 from common.geometry.transforms import transform
-from master.calibrate.cameras.boards import Board, Charuco
+from master.calibrate.cameras.boards import Board, Charuco, CircleGrid
 from tests.master.calibrate.cameras.board_scenes import SIZE, Scene
 
 _RAYS = 4  # per pixel and direction
@@ -63,6 +63,11 @@ def _texture(board: Board) -> tuple[Image, float]:
         return np.asarray(
             board.pattern().generateImage((board.columns * 96, board.rows * 96), marginSize=0), np.uint8
         ), 96.0
+    if isinstance(board, CircleGrid):
+        y, x = (np.indices((96 * (board.rows + 1), 96 * (board.columns + 1))) + 0.5) / 96.0
+        dark = np.hypot(x - np.rint(x), y - np.rint(y)) < 0.5 * board.circle_m / board.square_m
+        inner = (x > 0.5) & (y > 0.5) & (x < board.columns + 0.5) & (y < board.rows + 0.5)
+        return np.where(dark & inner, 0, 255).astype(np.uint8), 96.0
     squares = np.add.outer(np.arange(board.rows + 1), np.arange(board.columns + 1)) % 2
     return np.kron(squares * 255, np.ones((96, 96))).astype(np.uint8), 96.0
 

@@ -9,13 +9,22 @@ import pytest
 from common.arrays import Image
 from common.errors import CalibrationError, FitError
 from common.geometry.transforms import axis_rotation, rigid
-from master.calibrate.cameras.boards import Board, Charuco, Checkerboard, board_corners, find_board, orderings
+from master.calibrate.cameras.boards import (
+    Board,
+    Charuco,
+    Checkerboard,
+    CircleGrid,
+    board_corners,
+    find_board,
+    orderings,
+)
 from master.calibrate.cameras.views import look
 from tests.master.calibrate.cameras.board_images import render
 from tests.master.calibrate.cameras.board_scenes import scene
 
 CHECKER = Checkerboard(9, 6, 0.025)
 CHARUCO = Charuco(7, 5, 0.035, 0.026)
+CIRCLES = CircleGrid(7, 5, 0.035, 0.0175)
 
 
 @pytest.mark.parametrize(
@@ -31,6 +40,22 @@ def test_corners_are_found_to_a_fraction_of_a_pixel(board: Board, median_px: flo
         off.append(float(np.sqrt(np.nanmean((seen.corners_px - truth.corners(view, "left")) ** 2))))
     assert np.median(off) < median_px
     assert max(off) < 4 * median_px
+
+
+def test_centres_of_circles_are_found_and_not_those_of_ellipses() -> None:
+    truth = scene(21, 1, views=6, board=CIRCLES)
+    off: list[float] = []
+    for view in range(6):
+        seen = find_board(CIRCLES, render(truth, view, "left", seed=21))
+        if view == 2:  # the image's border cuts a circle
+            assert seen is None
+            continue
+        assert seen is not None
+        true = truth.corners(view, "left")  # half a turn looks the same
+        off.append(min(float(np.sqrt(np.mean((seen.corners_px[o] - true) ** 2))) for o in orderings(CIRCLES)))
+        assert seen.blur_px == pytest.approx(1.0, rel=0.3)
+    assert np.median(off) < 0.03  # centres of ellipses are off by 0.1 and more
+    assert max(off) < 0.1
 
 
 def test_an_upside_down_picture_has_the_same_corners_in_the_same_order() -> None:

@@ -72,8 +72,19 @@ def test_a_line_along_the_border_of_two_rows_is_refused() -> None:
     )
     a, b = np.rint(OPTICS.project(ends)).astype(int).tolist()
     cv2.line(laser, a, b, 255, 2)
-    with pytest.raises(FitError, match="less than a square"):
+    with pytest.raises(FitError, match="along the border of two rows .* shift the board"):
         line_on_board(laser, frames[AMBIENT], placed, BOARD, OPTICS)
+
+
+@pytest.mark.parametrize("colour", [0, 1, 2], ids=["blue", "green", "red"])
+def test_a_broad_line_of_any_colour_is_as_good(colour: int) -> None:
+    frames, placed = first()
+    ambient = np.repeat(frames[AMBIENT][..., None], 3, axis=2)
+    light = np.clip(frames[LASER].astype(float) - frames[AMBIENT], 0.0, None)
+    laser = ambient.astype(float)
+    laser[..., colour] += 4.0 * cv2.GaussianBlur(light, (0, 0), 5.0)
+    both = np.clip(laser.round(), 0, 255).astype(np.uint8)
+    assert off_plane_mm(both, ambient, placed) < 0.3
 
 
 @pytest.mark.parametrize(

@@ -183,7 +183,7 @@ def test_a_board_that_is_lit_in_the_laser_frame_needs_no_ambient_one(*, board_ap
     seed = 11
     fit = fit_plane(lines_of(lit_in_the_laser_frame(seed, 6, board_apart=board_apart), BOARD, OPTICS).lines)
     true = plane_of(seed)
-    assert fit.used.sum() >= 4
+    assert fit.used.sum() >= 5  # one is too steep for the finder, by whatever light
     assert angle_deg(np.array(fit.plane.normal), np.array(true.normal)) < 0.05
     assert 1e3 * abs(fit.plane.offset_m - true.offset_m) < 0.1
 
