@@ -30,6 +30,7 @@ from common.errors import FitError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import transform
 from common.recording.frame_recording import Illumination
+from master.calibrate.adjust import Normal, cauchy, minimise
 from master.calibrate.cameras.boards import Board, board_in, grid_shape
 from master.calibrate.picture import draw_flat_field
 from master.calibrate.report import finish
@@ -180,20 +181,20 @@ def fit_flat_field(samples: WhiteSamples, optics: CameraModel) -> FlatFit:
 
 
 def _law(xy: Float, light: Float) -> Float:
-    """Coefficients of the logarithm of k F, least squares with Huber's weights."""
+    """Coefficients of the logarithm of k F, by a robust fit."""
     terms, wanted = _law_terms(xy), np.log(light)
+    start = np.asarray(np.linalg.lstsq(terms, wanted, rcond=None)[0], np.float64)
     # Of paper (a view's samples err alike, so more than of one alone), and of a coefficient where the tangent is 1.
-    sample_sigma, correction_sigma = 0.02, 0.15
-    prior = np.full(terms.shape[1] - 2, (sample_sigma / correction_sigma) ** 2)
-    prior_information = np.diag(np.r_[0.0, 0.0, prior])
-    weight = np.ones(len(light))
-    found = np.zeros(terms.shape[1])
-    for _ in range(8):
-        normal = terms.T @ (weight[:, None] * terms) + prior_information
-        found = np.asarray(np.linalg.solve(normal, terms.T @ (weight * wanted)), np.float64)
-        off = np.abs(terms @ found - wanted)
-        weight = 1.0 / np.maximum(off / (2.5 * max(1.4826 * float(np.median(off)), 1e-6)), 1.0)
-    return found
+    sigma, correction_sigma = 0.02, 0.15
+    prior = np.r_[np.inf, np.inf, np.full(terms.shape[1] - 2, correction_sigma)]
+
+    def equations(law: Float) -> Normal:
+        out = Normal(len(law))
+        out.add(((terms @ law - wanted) / sigma)[:, None], terms[:, None] / sigma, loss=cauchy(2.5))
+        out.add_prior(law, prior)
+        return out
+
+    return minimise(equations, lambda law, step, _: law + step, start).x
 
 
 def _law_terms(xy: Float) -> Float:
