@@ -73,7 +73,26 @@ def measure_times(
     for camera in tuple(models)[1:]:  # 1.5 ms are 2 % of depth at half a metre and 1 m/s (B = 75 mm)
         if camera not in found or found[camera].sigma_ns > 1e6:
             raise CalibrationError(_refusal(next(iter(models)), camera, found.get(camera), messages))
+    _refuse_jump(models, frame_rate_hz, messages)
     return tuple(CameraTime(camera, offset) for camera, offset in found.items())
+
+
+def _refuse_jump(
+    models: Mapping[str, CameraModel],
+    frame_rate_hz: Mapping[str, float],
+    messages: Sequence[MarkerDetections],
+) -> None:
+    """Refuse stamps whose lateness is another in the second half of the recording."""
+    middle = len(messages) // 2
+    first, second = (_pass(models, frame_rate_hz, part) for part in (messages[:middle], messages[middle:]))
+    for camera in first.keys() & second.keys():
+        apart = abs(second[camera].offset_ns - first[camera].offset_ns)
+        if apart > max(1e6, 4.0 * float(np.hypot(first[camera].sigma_ns, second[camera].sigma_ns))):
+            raise CalibrationError(
+                f"camera {camera!r} is late by {1e-6 * first[camera].offset_ns:+.1f} ms in the first half and by"
+                f" {1e-6 * second[camera].offset_ns:+.1f} ms in the second: its stamps jumped (was it opened again, did"
+                " its machine sleep, or was the clock set?); record once more"
+            )
 
 
 def _pass(
@@ -101,11 +120,16 @@ def _refusal(
     reference: str, camera: str, offset: TimeOffset | None, messages: Sequence[MarkerDetections]
 ) -> str:
     known = "" if offset is None else f", only to {1e-6 * offset.sigma_ns:.1f} ms (standard deviation)"
-    parts = ", ".join(
-        f"{name}: {seconds:.1f} s, {speed:.0f} px/s"
-        for name, (seconds, speed) in _motion(messages, (reference, camera))
+    motion = _motion(messages, (reference, camera))
+    parts = ", ".join(f"{name}: {seconds:.1f} s, {speed:.0f} px/s" for name, (seconds, speed) in motion)
+    text = f"the time of camera {camera!r} cannot be measured{known}; markers seen and their speed: {parts}. {_ADVICE}"
+    moving = all(seconds > 3.0 and speed > 100.0 for _, (seconds, speed) in motion)
+    if offset is not None or not moving:
+        return text
+    return (
+        f"{text}. Markers moved enough, but no ray of {camera!r} meets those of {reference!r}: are pictures mirrored,"
+        " cameras exchanged, or moved since the rig was calibrated?"
     )
-    return f"the time of camera {camera!r} cannot be measured{known}; markers seen and their speed: {parts}. {_ADVICE}"
 
 
 def _motion(

@@ -373,6 +373,8 @@ def refuse_loose(seen: Observations) -> None:
         if guilty is None
         else f"{seen.names[guilty]} moved, or something else is taken for it"
     )
+    if guilty is None and len(loose) == len(change) > 1:
+        blame = f"all of them: a camera moved meanwhile, or {blame}"
     raise FitError(
         f"not rigid: distances between beads change ({listed}); {blame}. Fasten it and do the motion again"
     )

@@ -230,7 +230,7 @@ def fit_registration(seen: PoseTrack, tracker: PoseTrack, first: Placed) -> Fit:
     placed, scale = _refined(problem, better)
     rows = problem.rows(placed)
     changes: list[Float] = []  # of the unknowns when a block of time is omitted, by one step
-    for block in _blocks(problem.t_s):
+    for block in blocks_of(problem.t_s):
         step = problem.normal(rows, scale, np.where(block, 0.0, 1.0)).step(0.0)
         changes.append(np.zeros(_UNKNOWNS) if step is None else step[0])
     return Fit(
@@ -284,7 +284,7 @@ def _refined(problem: _Problem, placed: Placed) -> tuple[Placed, float]:
     return placed, scale
 
 
-def _blocks(t_s: Float) -> list[Bool]:
+def blocks_of(t_s: Float) -> list[Bool]:
     """One mask (N,) for each block of time: the epochs in it."""
     share = (t_s - t_s[0]) / (t_s[-1] - t_s[0] + 1e-9)
     blocks = 12

@@ -27,7 +27,14 @@ from common.recording.recorded_files import read_npz, write_npz
 from master.calibrate.picture import BLUE, GREEN, GREY, ORANGE, draw_over_time, figure_of, save_figure
 from master.calibrate.report import finish
 from master.calibrate.session import Session, listening
-from master.calibrate.tracker.fit import Fit, first_places, fit_registration, late_sigma_s, sigma_at
+from master.calibrate.tracker.fit import (
+    Fit,
+    blocks_of,
+    first_places,
+    fit_registration,
+    late_sigma_s,
+    sigma_at,
+)
 from master.calibrate.tracker.tracks import (
     MOTION,
     Coverage,
@@ -86,9 +93,13 @@ def register(objects: Sequence[ObjectPose], tracked: Sequence[TrackerPose]) -> R
             f" {MOTION}"
         )
     late_s = first_lag(seen, device)
-    first = None if late_s is None else first_places(seen, device, late_s)
-    if first is None or len(shared_epochs(seen, device, first.late_s, fewest)) < fewest:
+    if late_s is None or len(shared_epochs(seen, device, late_s, fewest)) < fewest:
         raise FitError(f"cameras and tracker hardly saw the object at the same time: {MOTION}")
+    if (first := first_places(seen, device, late_s)) is None:
+        raise FitError(
+            "no registration explains what was seen: cameras and tracker see it turn about other axes. Is it the right"
+            " device, are the tracking system's axes right-handed, and pictures not mirrored?"
+        )
     coverage = coverage_of(seen, device, first.late_s)
     fit = fit_registration(seen, device, first)
     figures = figures_of(fit)
@@ -134,6 +145,15 @@ def refuse(fit: Fit, figures: dict[str, float], coverage: Coverage) -> None:
     Raises:
         FitError: With what to do.
     """
+    own = ~fit.outlier
+    arm = fit.p_m[own] - fit.p_m[own].mean(axis=0)
+    size = 1.0 + float((fit.off[own, :3] * arm).sum() / max((arm**2).sum(), 1e-12))
+    if abs(size - 1.0) > 0.015:
+        raise FitError(
+            f"ways are {size:.3f} times as long for the cameras as for the tracker: were the squares of the cameras'"
+            " board as large as was said, and are tags and beads as large as the object's file says?"
+        )
+    _refuse_moved(fit)
     left_m, left_rad = 1e-3 * figures["position_mm"], np.radians(figures["rotation_deg"])
     if figures["outlier_share"] > 0.4 or left_m > 0.012 or left_rad > _LEFT_RAD:
         raise FitError(
@@ -153,6 +173,23 @@ def refuse(fit: Fit, figures: dict[str, float], coverage: Coverage) -> None:
         wanting.append(f"the clocks are known to {figures['late_sigma_ms']:.1f} ms only: move it faster")
     if wanting:
         raise FitError("; ".join([*wanting, *coverage.missing]) + f". {MOTION[0].upper()}{MOTION[1:]}")
+
+
+def _refuse_moved(fit: Fit) -> None:
+    """Refuse places that agree before and after some moment, but not with each other."""
+    blocks = [block & ~fit.outlier for block in blocks_of(fit.t_s)]
+    blocks = [block for block in blocks if block.any()]
+    place = np.array([np.median(fit.off[block, :3], axis=0) for block in blocks])
+    for k in range(3, len(place) - 2):
+        before, after = place[:k], place[k:]
+        step = float(np.linalg.norm(after.mean(axis=0) - before.mean(axis=0)))
+        within = np.concatenate([before - before.mean(axis=0), after - after.mean(axis=0)])
+        scatter = float(np.sqrt((within**2).sum(axis=1).mean()))
+        if step > max(5e-3, 4.0 * scatter):
+            raise FitError(
+                f"cameras and tracker disagree by {1e3 * step:.0f} mm from {fit.t_s[blocks[k]][0] - fit.t_s[0]:.0f} s"
+                " on: a camera, a base station or the tracker on the object moved then; fasten it and do it again"
+            )
 
 
 def report_lines(found: Registration) -> tuple[str, ...]:

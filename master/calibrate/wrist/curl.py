@@ -50,6 +50,13 @@ def fit_curls(laser_m: Float) -> tuple[FingerCurl, ...]:
     if all(curl.line is None for curl in curls):
         reasons = "; ".join(f"{curl.finger}: {curl.reason}" for curl in curls)
         raise FitError(f"no finger curled before the laser: {reasons}")
+    off = {found.finger: 1.0 - len(found.points_m) / found.seen for found in curls if found.line is not None}
+    if np.median(list(off.values())) > 0.25:
+        shares = ", ".join(f"{finger} {100 * share:.0f} %" for finger, share in off.items())
+        raise FitError(
+            f"points of most fingers lie off the line of the others ({shares}): the device slipped on the arm, or the"
+            " hand was moved sideways; fasten it, and curl again with the hand at rest"
+        )
     return curls
 
 

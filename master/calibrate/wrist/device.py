@@ -5,11 +5,11 @@ a recording or images. A board's pose and its uncertainty is the start of all th
 """
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import TypeVar, cast
 
 import cv2
 import numpy as np
@@ -22,9 +22,12 @@ from common.geometry.transforms import cross, transform
 from common.recording.frame_recording import MANIFEST, FrameRow, Illumination, open_recording
 from master.calibrate.cameras.boards import Board, board_corners, find_board
 from master.calibrate.cameras.bundle import place_board
-from master.calibrate.cameras.views import ENDINGS, load_image
+from master.calibrate.cameras.views import ENDINGS, Finder, load_image
+from master.calibrate.observations import thinned
 from master.calibrate.report import Write
 from master.calibrate.tree_files import rig_in_tree, write_rig
+
+Seen = TypeVar("Seen")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,8 +129,7 @@ def lit_views(folder: Path, camera: str, needed: Illumination) -> tuple[LitView,
             + (" (a laser's frame that shows the board may stand alone)" if len(wanted) == 1 else "")
         )
     most_views = 60  # more of the same motion adds time, not knowledge
-    chosen = np.unique(np.linspace(0, len(whole) - 1, min(most_views, len(whole))).round().astype(int))
-    return tuple(whole[int(i)] for i in chosen)
+    return tuple(whole[int(i)] for i in thinned(np.arange(len(whole)), most_views))
 
 
 def _recorded(folder: Path, camera: str) -> list[LitView]:
@@ -164,6 +166,34 @@ def _named(folder: Path) -> list[LitView]:
             lit = Illumination.LED if lit == "board" else Illumination(lit)
             found.setdefault(match[1], {})[lit] = partial(load_image, file)
     return [LitView(name or "0", frames) for name, frames in found.items()]
+
+
+def board_in_views(views: Sequence[LitView], board: Board) -> Board:
+    """The board as the first view that has it shows it: a ChArUco board in the layout in which it is printed.
+
+    Raises:
+        RecordingError: An image cannot be read.
+        FitError: No view shows it; the text says what they show instead, or what to do.
+    """
+    finder = Finder(board)
+    for view in views:
+        for image in (image for lit in Illumination for image in _showing(view, lit)):
+            if finder.find(image) is not None:
+                return finder.board
+    raise FitError(f"no board found in {len(views)} views, looking for the {board}: {finder.advice()}")
+
+
+def of_views(
+    views: Sequence[LitView], take: Callable[[LitView], Seen]
+) -> tuple[dict[str, Seen], dict[str, str]]:
+    """What `take` finds in each view, by name, and the reason (FitError) of every other view."""
+    found, refused = dict[str, Seen](), dict[str, str]()
+    for view in views:
+        try:
+            found[view.name] = take(view)
+        except FitError as error:
+            refused[view.name] = str(error)
+    return found, refused
 
 
 def grouped_by_reason(refused: Mapping[str, str]) -> list[str]:
@@ -214,19 +244,13 @@ def board_corners_of(view: LitView, board: Board, optics: CameraModel) -> Float:
     """
     seen: list[Float] = []
     for lit in (Illumination.AMBIENT, Illumination.LED, Illumination.LASER):
-        image = view.load(lit)
-        if image is None or (lit is Illumination.LASER and seen):
-            continue
-        if image.shape != (optics.height_px, optics.width_px):
-            raise FitError(
-                f"its image is {image.shape[1]} x {image.shape[0]} px,"
-                f" the camera {optics.width_px} x {optics.height_px}"
-            )
-        # A line is thinner than this, but small squares may be, too; a corner looks the same turned by 180 deg, so
-        # that its place stays.
-        for line_px in (7, 5, 3) if lit is Illumination.LASER else (1,):
-            opened = cast(Image, cv2.morphologyEx(image, cv2.MORPH_OPEN, np.ones((line_px, line_px))))
-            if (observation := find_board(board, opened)) is not None:
+        for image in () if lit is Illumination.LASER and seen else _showing(view, lit):
+            if image.shape != (optics.height_px, optics.width_px):
+                raise FitError(
+                    f"its image is {image.shape[1]} x {image.shape[0]} px,"
+                    f" the camera {optics.width_px} x {optics.height_px}"
+                )
+            if (observation := find_board(board, image)) is not None:
                 seen.append(observation.corners_px)
                 break
     if not seen:
@@ -237,6 +261,17 @@ def board_corners_of(view: LitView, board: Board, optics: CameraModel) -> Float:
     if not moved <= 1.0:
         raise FitError(f"the board moved by {moved:.1f} px between the frames: hold it still")
     return np.mean(seen, axis=0)
+
+
+def _showing(view: LitView, lit: Illumination) -> Iterator[Image]:
+    """Images of one kind in which a board is sought; a laser's without its line.
+
+    A line is thinner than 7 px, but small squares may be, too. A corner looks the same turned by 180 deg, so that
+    opening the image leaves its place.
+    """
+    if (image := view.load(lit)) is not None:
+        for line_px in (7, 5, 3) if lit is Illumination.LASER else (1,):
+            yield cast(Image, cv2.morphologyEx(image, cv2.MORPH_OPEN, np.ones((line_px, line_px))))
 
 
 def place_corners(corners_px: Float, board: Board, optics: CameraModel) -> BoardPose:

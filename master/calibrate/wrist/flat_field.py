@@ -39,10 +39,12 @@ from master.calibrate.wrist.device import (
     BoardPose,
     Device,
     LitView,
+    board_in_views,
     board_pose,
     device_of,
     grouped_by_reason,
     lit_views,
+    of_views,
     writes_rig,
 )
 
@@ -245,7 +247,9 @@ def flat_field(options: Namespace) -> None:
     device = device_of(options.source, options.rig, options.calibration, options.out)
     views = lit_views(options.source, device.camera.name, Illumination.LED)
     leds = np.array(device.rig.led) if device.rig.led else np.zeros((1, 3))
-    seen = white_of(views, board_in(options), device.optics, leds)
+    with refusals_named(options.source):
+        board = board_in_views(views, board_in(options))
+    seen = white_of(views, board, device.optics, leds)
     with refusals_named(options.source, grouped_by_reason(seen.refused)):
         fit = fit_flat_field(seen.samples, device.optics)
     report: dict[str, object] = {
@@ -267,20 +271,16 @@ def white_of(views: tuple[LitView, ...], board: Board, optics: CameraModel, led_
     Raises:
         RecordingError: An image cannot be read.
     """
-    found: list[tuple[Float, Float, Float]] = []
-    refused: dict[str, str] = {}
-    for view in views:
+
+    def of(view: LitView) -> tuple[Float, Float, Float]:
         led, ambient = view.load(Illumination.LED), view.load(Illumination.AMBIENT)
         assert led is not None  # `lit_views` gives whole ones
         assert ambient is not None
-        try:
-            placed = board_pose(view, board, optics)
-            found.append(white_samples(led, ambient, placed, board, optics, led_m))
-        except FitError as error:
-            refused[view.name] = str(error)
-    if not found:
-        found.append((np.empty((0, 2)), np.empty((0, 2)), np.empty(0)))
-    return WhiteSeen(gathered(found), len(views) - len(refused), refused)
+        return white_samples(led, ambient, board_pose(view, board, optics), board, optics, led_m)
+
+    found, refused = of_views(views, of)
+    samples = gathered(tuple(found.values()) or [(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))])
+    return WhiteSeen(samples, len(found), refused)
 
 
 def report_lines(fit: FlatFit, seen: WhiteSeen, views: int, *, known_leds: bool) -> list[str]:

@@ -34,9 +34,11 @@ from master.calibrate.wrist.device import (
     Device,
     LitView,
     board_corners_of,
+    board_in_views,
     device_of,
     grouped_by_reason,
     lit_views,
+    of_views,
     place_corners,
     writes_rig,
 )
@@ -316,7 +318,9 @@ def laser_plane(options: Namespace) -> None:
         raise UsageError("--unit is that of a cloud, and SOURCE is a folder")
     device = device_of(options.source, options.rig, options.calibration, options.out)
     views = lit_views(options.source, device.camera.name, Illumination.LASER)
-    seen = lines_of(views, board_in(options), device.optics)
+    with refusals_named(options.source):
+        board = board_in_views(views, board_in(options))
+    seen = lines_of(views, board, device.optics)
     with refusals_named(options.source, grouped_by_reason(seen.refused)):
         fit = fit_plane(seen.lines)
     note = f"{int(fit.used.sum())} of {len(fit.used)} views of a board"
@@ -354,21 +358,12 @@ def lines_of(views: tuple[LitView, ...], board: Board, optics: CameraModel) -> L
     Raises:
         RecordingError: An image cannot be read.
     """
-    focal = float(np.sqrt(optics.matrix[0, 0] * optics.matrix[1, 1]))
-    lines: list[ViewLine] = []
-    refused: dict[str, str] = {}
-    for view in views:
-        try:
-            placed, line = _line_of(view, board, optics)
-        except FitError as error:
-            refused[view.name] = str(error)
-            continue
-        lines.append(ViewLine.of(view.name, line, placed, focal))
-    return LinesSeen(tuple(lines), refused)
+    found, refused = of_views(views, lambda view: _line_of(view, board, optics))
+    return LinesSeen(tuple(found.values()), refused)
 
 
-def _line_of(view: LitView, board: Board, optics: CameraModel) -> tuple[BoardPose, BoardLine]:
-    """The board of a view, and the laser's line on it."""
+def _line_of(view: LitView, board: Board, optics: CameraModel) -> ViewLine:
+    """The laser's line on the board of a view."""
     laser, ambient = view.load(Illumination.LASER, colour=True), view.load(Illumination.AMBIENT, colour=True)
     assert laser is not None  # `lit_views` gives whole ones
     if ambient is not None and laser.shape != ambient.shape:
@@ -376,15 +371,15 @@ def _line_of(view: LitView, board: Board, optics: CameraModel) -> tuple[BoardPos
     corners = board_corners_of(view, board, optics)
     placed = place_corners(corners, board, optics)
     line = line_on_board(laser, ambient, placed, board, optics)
-    if set(view.frames) != {Illumination.LASER}:
-        return placed, line
-    # Corners near the line of the same picture are drawn towards it.
-    way = line.uv[-1] - line.uv[0]
-    across = np.array([-way[1], way[0]]) / np.linalg.norm(way)
-    near_px = 12.0
-    corners = np.where(np.abs((corners - line.uv[0]) @ across)[:, None] < near_px, np.nan, corners)
-    placed = place_corners(corners, board, optics)
-    return placed, line_on_board(laser, None, placed, board, optics)
+    if set(view.frames) == {Illumination.LASER}:
+        # Corners near the line of the same picture are drawn towards it.
+        way = line.uv[-1] - line.uv[0]
+        across = np.array([-way[1], way[0]]) / np.linalg.norm(way)
+        near_px = 12.0
+        corners = np.where(np.abs((corners - line.uv[0]) @ across)[:, None] < near_px, np.nan, corners)
+        placed = place_corners(corners, board, optics)
+        line = line_on_board(laser, None, placed, board, optics)
+    return ViewLine.of(view.name, line, placed, float(np.sqrt(optics.matrix[0, 0] * optics.matrix[1, 1])))
 
 
 def report_lines(fit: PlaneFit, seen: LinesSeen, views: int) -> list[str]:

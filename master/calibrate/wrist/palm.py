@@ -32,10 +32,12 @@ from master.calibrate.tree_files import matrix_of, print_lines, provenance, refu
 from master.calibrate.wrist.device import (
     BoardPose,
     Device,
+    board_in_views,
     board_pose,
     device_of,
     grouped_by_reason,
     lit_views,
+    of_views,
     writes_rig,
 )
 
@@ -147,6 +149,7 @@ def palm(options: Namespace) -> None:
     )
     with refusals_named(options.source):
         fit = _by_board(options.source, board_in(options), offset, device)
+        refuse_elsewhere(fit.T_camera_palm, device.rig)
     report: dict[str, object] = {
         "T_camera_palm": fit.T_camera_palm.tolist(),
         "rotation_sigma_deg": float(np.degrees(fit.rotation_sigma_rad)),
@@ -158,15 +161,26 @@ def palm(options: Namespace) -> None:
 
 
 def _by_board(source: Path, board: Board, offset: BoardOffset, device: Device) -> PalmFit:
-    placed: list[BoardPose] = []
-    refused: dict[str, str] = {}
-    for view in lit_views(source, device.camera.name, Illumination.LED):
-        try:
-            placed.append(board_pose(view, board, device.optics))
-        except FitError as error:
-            refused[view.name] = str(error)
+    views = lit_views(source, device.camera.name, Illumination.LED)
+    board = board_in_views(views, board)
+    placed, refused = of_views(views, lambda view: board_pose(view, board, device.optics))
     print_lines(f"left out: {reason}" for reason in grouped_by_reason(refused))
-    return palm_from_board(placed, board, offset)
+    return palm_from_board(tuple(placed.values()), board, offset)
+
+
+def refuse_elsewhere(T_camera_palm: Float, rig: RigCalibration) -> None:
+    """Refuse a palm far from where the rig file has it: another size of board or square shows nowhere else."""
+    if rig.T_camera_palm is None:
+        return
+    moved = T_camera_palm @ invert(np.array(rig.T_camera_palm))
+    turn = float(np.linalg.norm(matrix_to_rotation_vector(moved[:3, :3])))
+    shift = float(np.linalg.norm(T_camera_palm[:3, 3] - np.array(rig.T_camera_palm)[:3, 3]))
+    if shift > 0.03 or turn > np.radians(30.0):  # a drawing is right to a centimetre and ten degrees
+        raise FitError(
+            f"the palm lies {1e3 * shift:.0f} mm and {np.degrees(turn):.0f} deg from where the rig file has it: check"
+            " --board (columns across the hand), --square-mm and what the ruler measured; of a rebuilt device take"
+            " T_camera_palm out of the rig file first"
+        )
 
 
 def report_lines(fit: PalmFit) -> list[str]:

@@ -132,6 +132,11 @@ def _length_sigma(hand: HandProfile) -> Float:
 
 def _check(fit: Fit, seen: ImageObservations) -> None:
     """Refuse what does not reach the minimum, and what is not likely."""
+    tips, fewest = int(np.isfinite(seen.tip_uv[..., 0]).sum()), 8
+    if tips < fewest:
+        raise FitError(
+            f"{tips} fingertips are seen, at least {fewest} are needed: {MOTION}, in sight of the camera"
+        )
     knuckles = (seen.bend != FLAT) & ~fit.fist
     if not knuckles.any() or not fit.fist.any():
         missing = "closes to a fist" if knuckles.any() else "bends straight fingers at their knuckles"

@@ -1,11 +1,13 @@
 """A mounting from a motion without noise is that of the truth, by the command as by its parts; and what is refused."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from msgspec.structs import replace as replaced
 
+from common.arrays import Float
 from common.calibration import RigCalibration, load, save
 from common.errors import CalibrationError, FitError
 from common.geometry.transforms import quaternion_to_matrix
@@ -116,6 +118,24 @@ def test_what_was_not_seen_together_is_refused() -> None:
     others = tuple("back" if name == "index" else name for name in seen.both.markers.markers)
     with pytest.raises(FitError, match="no marker sits on the tip of the index finger"):
         calibrated(seen, markers=others)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda uv, _: np.stack([639.0 - uv[:, 0], uv[:, 1]], axis=1),
+        lambda uv, late: uv + np.array([0.0, 20.0 * late]),
+    ],
+    ids=["mirrored", "the device slipped"],
+)
+def test_pictures_that_no_mounting_explains_are_refused(change: Callable[[Float, bool], Float]) -> None:
+    seen = moved()
+    wrong = [
+        replaced(one, laser_uv=change(one.laser_uv, k > 60), tip_uv=change(one.tip_uv, k > 60))
+        for k, one in enumerate(seen.cycles)
+    ]
+    with pytest.raises(FitError, match=r"no mounting explains what was seen: .* of this hand and side"):
+        calibrated(seen, cycles=wrong)
 
 
 def test_a_device_without_an_imu_is_refused() -> None:

@@ -1,13 +1,16 @@
 """Beads of an object by its motion: within 0.3 mm of the truth; what is too little, loose or in one line is refused."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace as replaced
 
 from common.arrays import Float
 from common.errors import CalibrationError, FitError
 from common.geometry.transforms import fit_rigid, rigid, rotation_vector_to_matrix, transform
+from common.messages import MarkerDetections
 from master.calibrate.object.beads import (
     Measurement,
     changes,
@@ -16,8 +19,8 @@ from master.calibrate.object.beads import (
     measure_object,
     own_frame,
 )
-from master.calibrate.observations import Observations, points_of_poses, rows_of
-from tests.master.calibrate.object.motions import BEADS, PLACES_M, RIG, body, seen
+from master.calibrate.observations import Observations, points_of_detections, points_of_poses, rows_of
+from tests.master.calibrate.object.motions import BEADS, MODELS, PLACES_M, RATES, RIG, body, messages, seen
 
 
 def off_mm(found: Measurement) -> Float:
@@ -77,6 +80,33 @@ def test_a_bead_that_is_bent_aside_half_way_is_named(motion: Observations, bead:
     points[whole[later], bead] += 1e-3 * by_mm * (bundle.T[later, :3, :3] @ way)
     with pytest.raises(FitError, match=f"not rigid.*{BEADS[bead]} moved"):
         measure_object(replace(motion, value=points))
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (lambda uv, share: uv + np.array([4.0 * (share > 0.5), 0.0]), "not rigid.* a camera moved meanwhile"),
+        (
+            lambda uv, _: np.stack([639.0 - uv[:, 0], uv[:, 1]], axis=1),
+            "all beads are seen by two cameras at",
+        ),
+        (lambda uv, share: uv + (0.0 if share < 0.15 else np.nan), r"three beads|all beads .* at least 60"),
+        (lambda uv, _: uv + np.nan, "no bead is seen by two cameras at once"),
+    ],
+    ids=["camera moved", "mirrored", "few", "NaN"],
+)
+def test_a_fault_of_one_camera_is_refused_by_name(
+    change: Callable[[Float, float], Float], cause: str
+) -> None:
+    sent, camera = messages(1), RIG.cameras[1]
+    last, first = max(one.t_ns for one in sent), min(one.t_ns for one in sent)
+    wrong = list[MarkerDetections]()
+    for one in sent:
+        uv = change(one.uv, (one.t_ns - first) / (last - first)) if one.camera == camera else one.uv
+        seen_px = np.where(np.isnan(uv[:, 0]), np.nan, one.sigma_px)
+        wrong.append(replaced(one, uv=uv, sigma_px=seen_px))
+    with pytest.raises(FitError, match=cause):
+        measure_object(points_of_detections(RIG, MODELS, RATES, wrong, BEADS))
 
 
 def test_distances_of_what_is_rigid_stay_far_below_what_is_refused(motion: Observations) -> None:

@@ -95,6 +95,54 @@ def test_too_little_motion_is_refused_with_what_to_do(
     assert "up and down" in str(error.value)
 
 
+def of_right(change: Callable[[MarkerDetections, bool], MarkerDetections]) -> list[MarkerDetections]:
+    """A motion in which the right camera is changed, by whether it is in the second half."""
+    sent = messages_of(scenes.natural(2), 2.5)
+    middle = sent[len(sent) // 2].t_ns
+    return [change(one, one.t_ns > middle) if one.camera == "right" else one for one in sent]
+
+
+@pytest.mark.parametrize(
+    ("messages", "cause"),
+    [
+        (
+            lambda: of_right(
+                lambda one, late: msgspec.structs.replace(one, t_ns=one.t_ns + 8_000_000 * late)
+            ),
+            r"late by .* ms in the first half and by .* ms in the second: its stamps jumped",
+        ),
+        (
+            lambda: [
+                msgspec.structs.replace(one, camera=NAMES[one.camera == "left"])
+                for one in of_right(lambda one, _: one)
+            ],
+            "no ray of 'right' meets those of 'left': are pictures mirrored, cameras exchanged",
+        ),
+        (
+            lambda: [
+                msgspec.structs.replace(one, uv=np.stack([639.0 - one.uv[:, 0], one.uv[:, 1]], axis=1))
+                for one in of_right(lambda one, _: one)
+            ],
+            "no ray of 'right' meets those of 'left': are pictures mirrored, cameras exchanged",
+        ),
+        (
+            lambda: of_right(
+                lambda one, _: msgspec.structs.replace(
+                    one, uv=np.full_like(one.uv, np.nan), sigma_px=np.full_like(one.sigma_px, np.nan)
+                )
+            ),
+            r"cannot be measured; .* right: 0\.0 s, 0 px/s",
+        ),
+    ],
+    ids=["stamps jump", "exchanged", "mirrored", "NaN"],
+)
+def test_a_fault_of_the_recording_is_refused_by_name(
+    messages: Callable[[], list[MarkerDetections]], cause: str
+) -> None:
+    with pytest.raises(CalibrationError, match=cause):
+        measure_times(cameras(), RATES, messages())
+
+
 def test_the_rig_file_gets_the_offset_with_its_source_and_keeps_the_rest(tmp_path: Path) -> None:
     found = write_recording(tmp_path / "swing", messages_of(scenes.natural(2), 8.0))
     out = tmp_path / "calib"

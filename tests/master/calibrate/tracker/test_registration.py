@@ -1,5 +1,7 @@
 """A registration from simulated motions: right, sure of itself as it is right, and refused where it cannot be."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from msgspec.structs import replace
@@ -7,11 +9,13 @@ from msgspec.structs import replace
 from common.arrays import Float
 from common.errors import FitError
 from common.geometry.transforms import rigid, rotation_vector_to_matrix
-from common.messages import ObjectSource
+from common.messages import ObjectPose, ObjectSource, TrackerPose
 from master.calibrate.tracker.fit import Placed, closed_form
 from master.calibrate.tracker.registration import register
 from master.calibrate.tracker.tracks import first_lag, object_track, tracker_track
 from tests.master.calibrate.tracker.simulated import MIDDLE, ZERO_NS, Motion, errors_of
+
+Measured = tuple[list[ObjectPose], list[TrackerPose]]
 
 
 def test_without_noise_it_is_exact() -> None:
@@ -122,14 +126,57 @@ def test_numbers_that_are_none_count_as_not_seen() -> None:
     assert errors_of(motion, placed)[0] < 2.0
 
 
-def test_a_tracker_that_slipped_meanwhile_is_refused() -> None:
+def slipped() -> Measured:
     before, after = Motion(6), Motion(6)
-    slipped = rigid(rotation_vector_to_matrix(np.array([0.5, 0.0, 0.0])), np.array([0.04, 0.0, 0.0]))
-    object.__setattr__(after, "Y", after.Y @ slipped)
+    by = rigid(rotation_vector_to_matrix(np.array([0.5, 0.0, 0.0])), np.array([0.04, 0.0, 0.0]))
+    object.__setattr__(after, "Y", after.Y @ by)
     first, then = before.tracked(), after.tracked()
     half = len(first) // 2
-    with pytest.raises(FitError, match="Is the tracker firm"):
-        register(before.objects(), [*first[:half], *then[half:]])
+    return before.objects(), [*first[:half], *then[half:]]
+
+
+def with_cameras(change: Callable[[int, Float], Float]) -> Measured:
+    """The motion with the places of the cameras changed, by number of the pose."""
+    motion = Motion(6)
+    objects = [replace(one, position_m=change(k, one.position_m)) for k, one in enumerate(motion.objects())]
+    return objects, motion.tracked()
+
+
+def mirrored() -> Measured:
+    motion = Motion(6)
+    turn, place = np.array([1.0, 1.0, -1.0, -1.0]), np.array([-1.0, 1.0, 1.0])
+    return motion.objects(), [
+        replace(one, position_m=place * one.position_m, orientation_wxyz=turn * one.orientation_wxyz)
+        for one in motion.tracked()
+    ]
+
+
+@pytest.mark.parametrize(
+    ("measured", "cause"),
+    [
+        (slipped, "disagree by .* mm from 10 s on: a camera, a base station or the tracker"),
+        (
+            lambda: with_cameras(lambda k, p: p + np.array([0.01 * (k > 600), 0.0, 0.0])),
+            "from 10 s on: a camera, a base",
+        ),
+        (lambda: with_cameras(lambda _, p: 0.97 * p), r"ways are 0\.97\d times as long .* board .* tags"),
+        (lambda: with_cameras(lambda _, p: 1.1 * p), r"ways are 1\.0\d+ times as long .* board .* tags"),
+        (mirrored, "axes right-handed, and pictures not mirrored"),
+        (
+            lambda: (Motion(6).objects()[:50], Motion(6).tracked()),
+            "gave 49 poses, the tracker .* at least 60",
+        ),
+        (
+            lambda: with_cameras(lambda _, p: np.full_like(p, np.nan)),
+            "gave 0 poses, the tracker .* at least 60",
+        ),
+    ],
+    ids=["slipped", "camera moved", "too small", "too large", "mirrored", "few", "NaN"],
+)
+def test_a_fault_of_the_session_is_refused_by_name(measured: Callable[[], Measured], cause: str) -> None:
+    register(Motion(6).objects(), Motion(6).tracked())
+    with pytest.raises(FitError, match=cause):
+        register(*measured())
 
 
 def test_the_other_systems_frame_is_found_as_well() -> None:

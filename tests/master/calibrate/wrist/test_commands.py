@@ -229,7 +229,7 @@ def broken(boards: Path, folder: Path, what: str) -> Path:
 @pytest.mark.parametrize(
     ("what", "error", "match"),
     [
-        ("dark", FitError, "in 0 views, at least 3 are needed.*\n.*no board found"),
+        ("dark", FitError, "no board found in 7 views.*checkerboard of 9 x 6.*count the inner corners"),
         ("slipped", FitError, "in 0 views, at least 3 are needed.*\n.*view"),
         ("unlabelled", RecordingError, "frames.csv what lit"),
         ("no image", RecordingError, "000004.png: is no image"),

@@ -1,6 +1,7 @@
 """Who wears a device: knuckles and palm of simulated people are found again, and motions that tell nothing refused."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace as replaced
 from pathlib import Path
 
@@ -170,6 +171,35 @@ def test_a_motion_falls_into_its_bends() -> None:
 def test_a_motion_without_its_parts_is_refused(seen: Float, match: str) -> None:
     with pytest.raises(FitError, match=match):
         guided(seen)
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (lambda uv, _: np.stack([639.0 - uv[:, 0], uv[:, 1]], axis=1), "no likely subject.*hand and side"),
+        (lambda uv, name: uv + (np.nan if name == "tip" else 0.0), "0 fingertips are seen, at least 8"),
+        (lambda uv, name: uv + (np.nan if name == "laser" else 0.0), "0 fingers bend before the laser"),
+    ],
+    ids=["mirrored", "no tips", "no laser"],
+)
+def test_a_fault_of_the_device_is_refused_by_name(
+    people: dict[int, Person],
+    motions: dict[int, list[WristDetections]],
+    change: Callable[[Float, str], Float],
+    cause: str,
+) -> None:
+    person, wrong = people[40], list[WristDetections]()
+    for one in motions[40]:
+        laser, tip = change(one.laser_uv, "laser"), change(one.tip_uv, "tip")
+        laser_sigma, tip_sigma = (
+            np.where(np.isnan(uv[:, 0]), np.nan, sigma)
+            for uv, sigma in ((laser, one.laser_sigma_px), (tip, one.tip_sigma_px))
+        )
+        wrong.append(
+            replace(one, laser_uv=laser, tip_uv=tip, laser_sigma_px=laser_sigma, tip_sigma_px=tip_sigma)
+        )
+    with pytest.raises(FitError, match=cause):
+        calibrate_subject(wrong, person.rig, person.camera, person.hand)
 
 
 def test_a_hand_file_of_the_other_side_is_refused(
