@@ -28,6 +28,7 @@ from master.calibrate.cameras.boards import Checkerboard
 from master.calibrate.wrist.device import LitView
 from master.calibrate.wrist.laser_plane import PlaneFit, fit_plane, lines_of
 from master.calibrate.wrist.subject import Subject, calibrate_subject
+from master.calibrate.wrist.subject_model import UNKNOWN, Unknown
 from master.estimator.wrist_pipeline import WristPipeline
 from master.rig.setup import WristSetup
 
@@ -117,6 +118,15 @@ _LENS_SIGMA_PX = (0.35, 0.5)  # focal length, centre: of a calibration from a do
 _LIT = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
 
 
+def knuckle_sigma_m(found: Subject) -> Float:
+    """Standard deviations (4, 3) [m] of knuckles, by palm and hand file together."""
+    by_x, nudge = np.empty((4, 3, UNKNOWN)), 1e-5
+    for k, step in enumerate(nudge * np.eye(UNKNOWN)):
+        ahead, behind = (found.model.knuckles(Unknown.of(found.fit.x + by)) for by in (step, -step))
+        by_x[..., k] = (ahead - behind) / (2.0 * nudge)
+    return np.sqrt(np.einsum("fki,ij,fkj->fk", by_x, found.fit.covariance, by_x))
+
+
 def rows() -> Iterator[Row]:
     """Measure laser planes: normal [deg], offset [mm]; and subjects: palm [deg], knuckles [mm], PIP [deg]."""
     rig, cameras, _ = rig_files("wrist")
@@ -131,15 +141,15 @@ def _planes(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:
     for seed in _LASERS:
         plane = _plane_of(seed)
         scene, views = _shown(camera, rig, plane, max(_VIEWS), seed)
-        seen = lines_of(views, _BOARD, scene.optics())
+        lines, _ = lines_of(views, _BOARD, scene.optics())
         for count in _VIEWS:
             try:
-                fit = fit_plane(tuple(line for line in seen.lines if int(line.name) < count))
+                fit = fit_plane(tuple(line for line in lines if int(line.name) < count))
             except FitError:
                 refused[count] += 1
             else:
                 exact[count].append((fit, plane))
-        wrong_lens.append((fit_plane(lines_of(views, _BOARD, _wrong_lens(camera, seed)).lines), plane))
+        wrong_lens.append((fit_plane(lines_of(views, _BOARD, _wrong_lens(camera, seed))[0]), plane))
     for count in _VIEWS:
         note = f"{len(exact[count])} of {len(_LASERS)} seeds; {refused[count]} refused: board missed"
         yield from _errors(f"laser plane, {count} views", exact[count], note)
@@ -171,7 +181,7 @@ def _subjects() -> Iterator[Row]:
         before, after = person.errors(person.rig, person.hand), person.errors(found.rig, found.hand)
         rotation.append((before[0], after[0]))
         knuckle.append((before[1], after[1]))
-        unlikely.append(1e-3 * after[1] / found.knuckle_sigma_m)
+        unlikely.append(1e-3 * after[1] / knuckle_sigma_m(found))
         people.append((person, found))
     note = f"{len(people)} of {len(_SEEDS)} people; palm 3 deg, 2 mm, knuckles 5 mm off per axis"
     for k, axis in enumerate(("x, the pitch of the hand", "y", "z")):

@@ -14,6 +14,7 @@ from common.arrays import Bool, Float, Int
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import matrix_to_rotation_vector, rotation_vector_to_matrix
 from common.messages import HandPose, MarkerDetections
 from common.recording.frame_recording import FrameRecording, open_recording
 from master.calibrate.tree_files import load_marker_rig
@@ -78,6 +79,24 @@ def thinned(rows: Int, most: int) -> Int:
     return (
         rows if len(rows) <= most else rows[np.unique(np.linspace(0, len(rows) - 1, most).astype(np.int64))]
     )
+
+
+GAP_S = 0.06  # between samples of a turn: farther apart, what was between them is not known
+
+
+def between(samples_s: Float, t_s: Float) -> tuple[Int, Float, Bool]:
+    """Sample after each time (T,), share (T, 1) of the way to it, if both are near."""
+    after = np.clip(np.searchsorted(samples_s, t_s), 1, len(samples_s) - 1)
+    span = samples_s[after] - samples_s[after - 1]
+    share = (t_s - samples_s[after - 1]) / span
+    return after, np.clip(share, 0.0, 1.0)[:, None], (share >= 0.0) & (share <= 1.0) & (span <= GAP_S)
+
+
+def turned(R: Float, after: Int, share: Float) -> Float:
+    """Rotations (T, 3, 3) on the arc between samples R (S, 3, 3), as of `between`."""
+    before = R[after - 1]
+    arc = matrix_to_rotation_vector(np.swapaxes(before, 1, 2) @ R[after])
+    return before @ rotation_vector_to_matrix(share * arc)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -152,6 +152,11 @@ def framed(axes: "Axes", optics: CameraModel, title: str) -> None:
     axes.set(xlim=(0, optics.width_px), ylim=(optics.height_px, 0), aspect="equal", title=title)
 
 
+def _dots_and_rings(axes: "Axes", seen: Float, fitted: Float, colour: str) -> None:
+    axes.plot(*seen.T, ".", color=colour, markersize=5)
+    axes.plot(*fitted.T, "o", color=colour, markerfacecolor="none", markersize=8)
+
+
 def draw_subject(path: Path, found: "Subject", optics: CameraModel) -> None:
     """Draw laser points, fingertips and knuckles, seen (dots) and fitted (rings)."""
     model, fit, seen = found.model, found.fit, found.seen
@@ -163,11 +168,9 @@ def draw_subject(path: Path, found: "Subject", optics: CameraModel) -> None:
     framed(image, optics, "fingertips (dots), as fitted (rings); knuckles, before (+) and after (x)")
     for f, colour in enumerate(FINGER_COLOURS[1:]):
         own = used[:, f]
-        above.plot(*(1e3 * seen.laser_m[own, f]).T, ".", color=colour, markersize=4)
-        above.plot(*(1e3 * shown[own, f, :2]).T, "o", color=colour, markerfacecolor="none", markersize=7)
-        image.plot(*seen.tip_uv[own, f].T, ".", color=colour, markersize=5)
-        tips = shown[own & np.isfinite(seen.tip_uv[:, f, 0]), f, 2:]
-        image.plot(*tips.T, "o", color=colour, markerfacecolor="none", markersize=8)
+        _dots_and_rings(above, 1e3 * seen.laser_m[own, f], 1e3 * shown[own, f, :2], colour)
+        tips = own & np.isfinite(seen.tip_uv[:, f, 0])
+        _dots_and_rings(image, seen.tip_uv[tips, f], shown[tips, f, 2:], colour)
     image.plot(*optics.project(model.knuckles(model.none)).T, "+", color=GREY, markersize=12)
     image.plot(*optics.project(model.knuckles(found.unknown)).T, "x", color=BLUE, markersize=10)
     above.set(title="laser points from above [mm]: dots seen, rings fitted", xlabel="across", ylabel="along")
@@ -203,10 +206,8 @@ def draw_extrinsics(path: Path, found: "Extrinsics", optics: CameraModel) -> Non
     framed(image, optics, "fingertips (dots), as fitted (rings)")
     for f, colour in enumerate(FINGER_COLOURS[1:]):
         lit, tipped = (np.isfinite(fit.off[:, f, k]) for k in (0, 2))
-        above.plot(*(1e3 * seen[lit, f, :2]).T, ".", color=colour, markersize=4)
-        above.plot(*(1e3 * fit.shown[lit, f, :2]).T, "o", color=colour, markerfacecolor="none", markersize=7)
-        image.plot(*seen[tipped, f, 2:].T, ".", color=colour, markersize=5)
-        image.plot(*fit.shown[tipped, f, 2:].T, "o", color=colour, markerfacecolor="none", markersize=8)
+        _dots_and_rings(above, 1e3 * seen[lit, f, :2], 1e3 * fit.shown[lit, f, :2], colour)
+        _dots_and_rings(image, seen[tipped, f, 2:], fit.shown[tipped, f, 2:], colour)
     above.set(title="laser points from above [mm]: dots seen, rings fitted", xlabel="across", ylabel="along")
     above.set_aspect("equal")
     for values, colour, name in (

@@ -138,10 +138,9 @@ def _motion(
     """How long each camera saw markers [s], and their rms speed [px/s]."""
     out: list[tuple[str, tuple[float, float]]] = []
     for camera in cameras:
-        frames = [message for message in messages if message.camera == camera]
-        seen = [frame.t_ns for frame in frames if np.isfinite(frame.uv).any()]
-        length = 1e-9 * (max(seen) - min(seen)) if seen else 0.0
-        if len(frames) < 2 or not seen:
+        frames = [one for one in messages if one.camera == camera and np.isfinite(one.uv).any()]
+        length = 1e-9 * (frames[-1].t_ns - frames[0].t_ns) if frames else 0.0
+        if len(frames) < 2:
             out.append((camera, (length, 0.0)))
             continue
         t_s = 1e-9 * np.array([frame.t_ns - frames[0].t_ns for frame in frames])

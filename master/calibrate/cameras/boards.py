@@ -286,7 +286,7 @@ def _circles(board: CircleGrid, grey: Image) -> Float | None:
 
 
 def _not_mirrored(board: Board, corners: Float) -> Float:
-    """Corners as (rows, columns, 2), with the columns in the order that a camera sees."""
+    """Corners as (rows, columns, 2), columns in the order that a camera sees."""
     grid = corners.reshape(*grid_shape(board), 2)
     along, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     return grid[:, ::-1] if along[0] * down[1] - along[1] * down[0] < 0.0 else grid

@@ -32,18 +32,8 @@ from common.errors import CalibrationError, FitError
 from common.geometry.camera_model import CameraModel
 from master.calibrate.adjust import Normal
 from master.calibrate.depth.session import sweep_live
-from master.calibrate.depth.source import (
-    Measured,
-    Pair,
-    measured_from,
-    parse_target,
-    refuse_idle,
-)
-from master.calibrate.depth.sweep import (
-    Sweep,
-    check_enough,
-    checked,
-)
+from master.calibrate.depth.source import Measured, Pair, measured_from, parse_target, refuse_idle
+from master.calibrate.depth.sweep import Sweep, check_enough, checked
 from master.calibrate.picture import figure_of, save_figure
 from master.calibrate.report import Column, Table, finish
 from master.calibrate.tree_files import provenance, refusals_named, rig_in_tree, write_into_rig
@@ -379,14 +369,6 @@ def laws_note(report: DepthReport, rig: RigCalibration, use: str | None) -> str:
     return text
 
 
-def means_line(report: DepthReport) -> str:
-    """The mean error before and after."""
-    before = [name for name in report.errors if name not in report.rejected]
-    was = f"before {100 * report.mean_max(before[-1])[0]:.2f} % ({before[-1]}), " if before else ""
-    after = ", ".join(f"{100 * report.mean_max(name)[0]:.2f} % ({name})" for name in report.rejected)
-    return f"mean error: {was}after {after}"
-
-
 def sweep_of(options: Namespace) -> Measured:
     """The sweep that the options name: live, of a recording or of a table."""
     outline = parse_target(options.target)
@@ -404,7 +386,10 @@ def depth(options: Namespace) -> None:
     base = rig_to_write(pair, options.out)
     with refusals_named(measured.data):
         sweep = checked(measured.sweep, pair.cameras, pair.size_px)
-        report = fit_depth(sweep, laws_before(pair, base))
+        before: dict[str, DepthLaw] = {} if pair.models is None else {"ideal": ideal_of(*pair.models)}
+        for name, law in ({} if base is None else laws_of(base)).items():
+            before[f"previous {name.partition('_')[0]}"] = law
+        report = fit_depth(sweep, before)
     use: str | None = options.use
 
     def write(out: Path) -> dict[Path, str]:
@@ -429,17 +414,8 @@ def depth(options: Namespace) -> None:
         )
         return dict.fromkeys(written, laws_note(report, base, use))
 
-    lines = [measured.about, *report_lines(report), means_line(report)]
+    lines = [measured.about, *report_lines(report)]
     draw = partial(
         draw_errors, title=measured.about, distance_m=sweep.distance_m, errors=report.errors, used=report.used
     )
     finish(options, lines, report_json(report), draw, write)
-
-
-def laws_before(pair: Pair, rig: RigCalibration | None) -> dict[str, DepthLaw]:
-    """The laws without this fit: that of ideal cameras, and what the rig file holds."""
-    laws: dict[str, DepthLaw] = {}
-    if pair.models is not None:
-        laws["ideal"] = ideal_of(*pair.models)
-    previous = {} if rig is None else laws_of(rig)
-    return laws | {f"previous {name.partition('_')[0]}": law for name, law in previous.items()}

@@ -90,15 +90,11 @@ class Sweep:
         """All places of several sweeps, in their order."""
         if not parts:
             return Sweep.of_disparity(np.empty(0), np.empty(0), ())
-        return Sweep(
-            np.concatenate([part.distance_m for part in parts]),
-            np.concatenate([part.disparity_px for part in parts]),
-            np.concatenate([part.uv for part in parts]),
-            np.concatenate([part.area_px2 for part in parts]),
-            np.concatenate([part.sigma_px for part in parts]),
-            np.concatenate([part.frames for part in parts]),
-            tuple(name for part in parts for name in part.place),
-        )
+        rows = [(one.distance_m, one.disparity_px, one.uv, one.area_px2, one.sigma_px) for one in parts]
+        distance, disparity, uv, area, sigma = (np.concatenate(column) for column in zip(*rows, strict=True))
+        frames = np.concatenate([one.frames for one in parts])
+        places = tuple(name for one in parts for name in one.place)
+        return Sweep(distance, disparity, uv, area, sigma, frames, places)
 
     def names(self, chosen: Bool | Int) -> str:
         """The chosen places in words: "0.45 m (line 12), 0.5 m (line 13)"."""

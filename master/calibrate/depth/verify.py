@@ -24,12 +24,7 @@ from master.calibrate.depth.sweep import Sweep, check_places, parse_distances, p
 from master.calibrate.report import Column, Table, finish, plain
 from master.calibrate.tree_files import refusals_named
 from master.estimator.sensors import CameraArrays
-from master.fabrik.depth import (
-    DepthLaw,
-    ErrorBudget,
-    error_budget,
-    tolerable_skew_s,
-)
+from master.fabrik.depth import DepthLaw, ErrorBudget, error_budget, tolerable_skew_s
 from master.fabrik.intersection import triangulate
 
 Cameras = tuple[CameraModel, CameraModel]
@@ -130,18 +125,6 @@ def off_axis(law: DepthLaw, cameras: Cameras, distance_m: Float, angle_deg: Floa
     return np.where(inside, depth / distance_m - 1.0, np.nan)
 
 
-def budget(cameras: Cameras, distance_m: Float, noise: Noise) -> list[ErrorBudget]:
-    """What to expect at each distance, from focal length, baseline, noise and time."""
-    law = ideal_of(*cameras)
-    baseline_m = float(np.linalg.norm(cameras[1].centre - cameras[0].centre))
-    return [
-        error_budget(
-            law, d, baseline_m, sigma_px=noise.sigma_px, speed_m_s=noise.speed_m_s, skew_s=noise.skew_s
-        )
-        for d in distance_m.tolist()
-    ]
-
-
 def measured_table(found: Verified) -> Table:
     """Errors by distance and model, and their means; beside them what noise explains."""
     models: list[Column] = []
@@ -239,7 +222,11 @@ def depth_command(options: Namespace) -> None:
 def verify_rig(options: Namespace) -> None:
     """Report each depth model's error at known distances, and the error budget."""
     refuse_idle("--verify", out=options.out, use=options.use)
-    noise = _noise(options.sigma_px, options.speed_m_s, options.skew_ms)
+    for option in ("sigma_px", "speed_m_s", "skew_ms"):
+        if not 0.0 <= (value := float(vars(options)[option])) < np.inf:
+            name = option.replace("_", "-")
+            raise CalibrationError(f"--{name} {value:g}: expected a number that is not negative")
+    noise = Noise(options.sigma_px, options.speed_m_s, 1e-3 * options.skew_ms)
     lines, numbers, draw = list[str](), dict[str, object](), None
     if options.source is None and not options.live:
         pair = load_pair(options.calibration, options.rig or "desk", options.fov_deg)
@@ -304,9 +291,13 @@ def _expected(pair: Pair, distance: Float, angle: Float, noise: Noise) -> tuple[
         return [
             "no budget: focal length and baseline are not known (--rig NAME; --fov-deg without intrinsics)"
         ], {}
-    expected = budget(pair.models, distance, noise)
     errors = {name: off_axis(law, pair.models, distance, angle) for name, law in laws_of(pair.rig).items()}
-    baseline_m = float(np.linalg.norm(pair.models[1].centre - pair.models[0].centre))
+    baseline_m, ideal = (
+        float(np.linalg.norm(pair.models[1].centre - pair.models[0].centre)),
+        ideal_of(*pair.models),
+    )
+    assumed = {"sigma_px": noise.sigma_px, "speed_m_s": noise.speed_m_s, "skew_s": noise.skew_s}
+    expected = [error_budget(ideal, d, baseline_m, **assumed) for d in distance.tolist()]
     wanted = 0.02  # of the depth, as the published rig
     apart_ms = 1e3 * tolerable_skew_s(wanted, baseline_m, 1.0)
     optics = (
@@ -329,10 +320,3 @@ def _angles(text: str) -> Float:
     if not (np.abs(angles) < 90.0).all():
         raise CalibrationError(f"--angles {text!r}: expected angles between -90 and 90 degrees")
     return angles
-
-
-def _noise(sigma_px: float, speed_m_s: float, skew_ms: float) -> Noise:
-    for option, value in (("--sigma-px", sigma_px), ("--speed-m-s", speed_m_s), ("--skew-ms", skew_ms)):
-        if not (np.isfinite(value) and value >= 0.0):
-            raise CalibrationError(f"{option} {value:g}: expected a number that is not negative")
-    return Noise(sigma_px, speed_m_s, skew_ms * 1e-3)

@@ -25,7 +25,7 @@ from common.messages import HandPose, ImuSample, WristDetections
 from common.recording.frame_recording import FrameRecording, open_recording
 from master.calibrate.extrinsics.problem import fit_extrinsics
 from master.calibrate.extrinsics.tracks import FINGERS as LASER_FINGERS
-from master.calibrate.extrinsics.tracks import GAP_S, HandTrack, ImuTrack, LinesOfSight
+from master.calibrate.extrinsics.tracks import HandTrack, ImuTrack, LinesOfSight
 from master.calibrate.extrinsics.unknown import (
     CAMERA_IMU,
     CAMERA_LATE,
@@ -36,7 +36,7 @@ from master.calibrate.extrinsics.unknown import (
     StrobeCycles,
     started,
 )
-from master.calibrate.observations import detections_of
+from master.calibrate.observations import GAP_S, detections_of, thinned
 from master.calibrate.picture import draw_extrinsics
 from master.calibrate.report import finish
 from master.calibrate.tree_files import matrix_of, provenance, refusals_named
@@ -187,7 +187,7 @@ def calibrate_extrinsics(
         CalibrationError: The rig lacks its laser plane, palm pose or IMU.
     """
     if rig.imu is None:
-        raise CalibrationError(f"rig {rig.name!r}: imu: missing; nothing else measures the bend of the wrist")
+        raise _without_imu(rig.name)
     if not (poses and cycles and samples):
         missing = "the markers" if not poses else "the wrist camera" if not cycles else "the IMU"
         raise FitError(f"{missing} saw nothing: {MOTION}")
@@ -209,6 +209,10 @@ def calibrate_extrinsics(
     refuse(fit, sigma)
     new = _documented(rig, camera, rig.imu, fit, imu, sigma, source)
     return Extrinsics(new, report_lines(fit, sigma, len(cycles)), fit, seen.of(chosen), sigma)
+
+
+def _without_imu(rig: str) -> CalibrationError:
+    return CalibrationError(f"rig {rig!r}: imu: missing; nothing else measures the bend of the wrist")
 
 
 def _marker_of(model: HandModel, markers: tuple[str, ...], finger: str) -> int:
@@ -270,8 +274,7 @@ def _chosen(hand: HandTrack, imu: ImuTrack, seen: StrobeCycles) -> Bool:
             f"the IMU was silent for {imu.gap_s:.2f} s: its turns cannot be summed up; record again"
         )
     out = np.zeros(len(seen.t_s), np.bool_)
-    most = 200  # strobe cycles: more of the same motion add time, not information
-    out[rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(np.int64))]] = True
+    out[thinned(rows, 200)] = True  # strobe cycles: more of the same motion add time, not information
     return out
 
 
@@ -329,9 +332,7 @@ def extrinsics(options: Namespace) -> None:
             f"rig {device.file_name!r}: T_camera_palm: a first guess is needed, such as from the drawing of the device"
         )
     if device.rig.imu is None:
-        raise CalibrationError(
-            f"rig {device.file_name!r}: imu: missing; only the IMU measures the bend of the wrist"
-        )
+        raise _without_imu(device.file_name)
     opened = open_recording(options.recording)
     markers = opened.manifest.marker_rig()
     setup = RigSetup.of(

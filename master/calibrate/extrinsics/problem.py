@@ -55,6 +55,7 @@ from master.calibrate.extrinsics.unknown import (
     Unknown,
     prior_sigma,
 )
+from master.calibrate.observations import thinned
 from master.estimator.kinematics import BodyPoints
 from master.estimator.parameters import HandParameters
 from master.estimator.priors import PosturePrior, posture_prior_of
@@ -433,8 +434,7 @@ def fit_extrinsics(
     `names` are the track's markers, in order; `px_per_m` is what a metre at the tips is in the image. Of the
     first guesses `firsts` one is right to some 15 degrees, 15 mm and 20 ms.
     """
-    some = np.unique(np.linspace(0, len(cycles.t_s) - 1, 40).astype(np.int64))
-    coarse = cycles.of(some)
+    coarse = cycles.of(thinned(np.arange(len(cycles.t_s)), 40))
     best: tuple[float, Unknown] | None = None
     for first in firsts:
         problem = Problem(lines_of_sight, model, names, hand, imu, coarse, px_per_m, first)

@@ -17,19 +17,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.geometry.transforms import (
-    matrix_to_rotation_vector,
-    quaternion_to_matrix,
-    rotation_vector_to_matrix,
-)
+from common.geometry.transforms import quaternion_to_matrix, rotation_vector_to_matrix
 from common.hand.model import WRIST, Fingertips, HandModel
 from common.hand.skin import PalmarSurface
 from common.messages import HandPose, ImuSample
 from master.calibrate.laser_intersection import LaserIntersection
+from master.calibrate.observations import between, turned
 from master.estimator.sensors import PlaneAxes
 from master.rig.setup import WristSetup
 
-GAP_S = 0.06  # between samples of an IMU
 _EYE = np.eye(3)
 
 
@@ -183,31 +179,18 @@ class ImuTrack:
 
     def at(self, t_s: Float) -> ImuOrientations:
         """The IMU at times (T,) [s] of its stamps, by its rates."""
-        after, share, known = self._between(t_s)
-        before = self._integrated[after - 1]
-        R = before @ _share_of_arc(before, self._integrated[after], share)
+        after, share, known = between(self.t_s, t_s)
+        R = turned(self._integrated, after, share)
         drift = (1.0 - share)[..., None] * self._drift[after - 1] + share[..., None] * self._drift[after]
         R[~known] = np.nan
         return ImuOrientations(R, self._rate[after], drift)
 
     def held_at(self, t_s: Float) -> Float:
         """The samples' own orientations (T, 3, 3), IMU -> z-up world; NaN: none nearby."""
-        after, share, known = self._between(t_s)
-        R = self._held[after - 1] @ _share_of_arc(self._held[after - 1], self._held[after], share)
+        after, share, known = between(self.t_s, t_s)
+        R = turned(self._held, after, share)
         R[~known] = np.nan
         return R
-
-    def _between(self, t_s: Float) -> tuple[Int, Float, Bool]:
-        """The sample after each time, the share (T, 1) up to it, whether both are near."""
-        after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self.t_s) - 1)
-        start, stop = self.t_s[after - 1], self.t_s[after]
-        known = (t_s >= start) & (t_s <= stop) & (stop - start <= GAP_S)
-        return after, ((t_s - start) / (stop - start))[:, None], known
-
-
-def _share_of_arc(first: Float, second: Float, share: Float) -> Float:
-    """Part (T, 1) of the rotation from the first to the second, in the first's axes."""
-    return rotation_vector_to_matrix(share * matrix_to_rotation_vector(np.swapaxes(first, 1, 2) @ second))
 
 
 FINGERS = slice(1, 5)

@@ -115,9 +115,8 @@ class StrobeCycles:
 
     def of(self, rows: Int | Bool) -> "StrobeCycles":
         """Some of them."""
-        seen = self.laser_m, self.laser_sigma_m, self.tip_uv, self.tip_sigma_px
-        laser_m, sigma_m, uv, uv_sigma = (part[rows] for part in seen)
-        return StrobeCycles(self.t_s[rows], laser_m, sigma_m, uv, uv_sigma, self.tip_late_s)
+        laser_m, sigma_m, uv = self.laser_m[rows], self.laser_sigma_m[rows], self.tip_uv[rows]
+        return StrobeCycles(self.t_s[rows], laser_m, sigma_m, uv, self.tip_sigma_px[rows], self.tip_late_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

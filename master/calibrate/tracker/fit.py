@@ -33,7 +33,7 @@ from common.geometry.transforms import (
     skew,
 )
 from master.calibrate.adjust import Normal, minimise, tukey
-from master.calibrate.tracker.tracks import PoseTrack, shared_epochs
+from master.calibrate.tracker.tracks import PoseTrack, nearest_rotation, shared_epochs
 
 _DRAWN = 6
 _NEAR_RAD = np.radians(6.0)
@@ -103,7 +103,7 @@ def closed_form(RA: Float, pA: Float, RB: Float, pB: Float) -> tuple[Float, Floa
     if _rotation_residual(RX, RY, RA, RB) > _rotation_residual(-RX, RY, RA, RB):
         RX = -RX
     RX, RY = (RX, RY) if np.linalg.det(RX) > 0.0 else (-RX, -RY)
-    RX, RY = _nearest(RX), _nearest(RY)
+    RX, RY = nearest_rotation(RX), nearest_rotation(RY)
     lines = np.concatenate([RA, np.broadcast_to(-np.eye(3), RA.shape)], axis=2).reshape(-1, 6)
     shifts: Float = np.asarray(np.linalg.lstsq(lines, (pB @ RX.T - pA).ravel(), rcond=None)[0], np.float64)
     return rigid(RX, shifts[3:]), rigid(RY, shifts[:3])
@@ -118,12 +118,6 @@ def _rotation(stacked: Float) -> Float:
 
 def _rotation_residual(RX: Float, RY: Float, RA: Float, RB: Float) -> float:
     return float(((RA @ RY - RX @ RB) ** 2).sum())
-
-
-def _nearest(matrix: Float) -> Float:
-    """The rotation nearest to a matrix (3, 3)."""
-    left, _, right = np.linalg.svd(matrix)
-    return np.asarray(left @ np.diag([1.0, 1.0, float(np.linalg.det(left @ right))]) @ right)
 
 
 TRACKER_RAD = np.radians(0.15)

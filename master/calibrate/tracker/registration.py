@@ -218,24 +218,20 @@ def documented(
 ) -> tuple[RigCalibration, ObjectProfile]:
     """Rig and object with what was measured, and where that comes from."""
     placed = found.fit.placed
-    how = provenance(
-        TOOL,
-        (source,),
-        {name: round(value, 4) for name, value in found.figures.items()},
-        f"object {profile.name}, tracker {profile.tracker}: until base stations, cameras or mount are moved",
+    note = (
+        f"object {profile.name}, tracker {profile.tracker}: until base stations, cameras or mount are moved"
     )
-    new_rig = replace(
-        rig,
-        T_rig_tracking=matrix_of(placed.T_rig_tracking),
-        provenance=rig.provenance | {"T_rig_tracking": how},
+    how = provenance(TOOL, (source,), found.figures, note)
+    in_rig, in_object = (
+        rig.provenance | {"T_rig_tracking": how},
+        profile.provenance | {"T_object_tracker": how},
     )
-    new_object = replace(
+    return replace(rig, T_rig_tracking=matrix_of(placed.T_rig_tracking), provenance=in_rig), replace(
         profile,
         T_object_tracker=matrix_of(placed.T_object_tracker),
         stamp_offset_us=round(1e6 * placed.late_s, 1),
-        provenance=profile.provenance | {"T_object_tracker": how},
+        provenance=in_object,
     )
-    return new_rig, new_object
 
 
 def tracker(options: Namespace) -> None:
@@ -260,13 +256,10 @@ def tracker(options: Namespace) -> None:
 
     def write(out: Path) -> dict[Path, str]:
         path = out / "objects" / f"{profile.name}.json"
-        there = load(path, ObjectProfile) if path.exists() else profile
-        there = replace(there, tracker=profile.tracker)
-        new_rig, new_object = documented(rig_in_tree(out, options.rig, rig), there, found, source)
-        return {
-            write_object(out, new_object): "T_object_tracker, stamp_offset_us",
-            write_rig(out, options.rig, new_rig): "T_rig_tracking",
-        }
+        there = replace(load(path, ObjectProfile) if path.exists() else profile, tracker=profile.tracker)
+        new_rig, new = documented(rig_in_tree(out, options.rig, rig), there, found, source)
+        in_rig = {write_rig(out, options.rig, new_rig): "T_rig_tracking"}
+        return in_rig | {write_object(out, new): "T_object_tracker, stamp_offset_us"}
 
     finish(options, report_lines(found), summary(found), partial(draw_registration, found=found), write)
 

@@ -4,20 +4,16 @@ Tracks of cameras and tracking system can be interpolated at any time. Coverage:
 object's axes, path, pace; and what is missing.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.errors import FitError
-from common.geometry.transforms import (
-    matrix_to_rotation_vector,
-    quaternion_to_matrix,
-    rotation_vector_to_matrix,
-)
+from common.geometry.transforms import matrix_to_rotation_vector, quaternion_to_matrix
 from common.messages import ObjectPose, ObjectSource, TrackerPose
-from master.calibrate.observations import thinned
+from master.calibrate.observations import between, thinned, turned
 from master.calibrate.session import Progress, Session
 
 _NOT_ITS_OWN = (ObjectSource.TRACKER, ObjectSource.HELD, ObjectSource.NONE)
@@ -37,55 +33,37 @@ class PoseTrack:
 
     def at(self, t_s: Float) -> tuple[Float, Float, Bool]:
         """Rotations (T, 3, 3), positions (T, 3) at times (T,) [s], and which are known."""
-        after, share, known = self._between(t_s)
-        before = after - 1
-        step = matrix_to_rotation_vector(self.R[before].swapaxes(1, 2) @ self.R[after])
-        rotation = self.R[before] @ rotation_vector_to_matrix(share[:, None] * step)
-        place = self.p_m[before] + share[:, None] * (self.p_m[after] - self.p_m[before])
-        return rotation, place, known
-
-    def _between(self, t_s: Float) -> tuple[Int, Float, Bool]:
-        after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self.t_s) - 1)
-        span = self.t_s[after] - self.t_s[after - 1]
-        share = (t_s - self.t_s[after - 1]) / span
-        gap_s = 0.06  # between poses: farther apart, what was between them is not known
-        return after, np.clip(share, 0.0, 1.0), (share >= 0.0) & (share <= 1.0) & (span <= gap_s)
+        after, share, known = between(self.t_s, t_s)
+        place = self.p_m[after - 1] + share * (self.p_m[after] - self.p_m[after - 1])
+        return turned(self.R, after, share), place, known
 
 
 def object_track(poses: Iterable[ObjectPose], zero_ns: int) -> PoseTrack:
     """Track of an object by cameras, rig frame; not of held or tracker-made poses."""
     own = [one for one in poses if one.tracked and one.source not in _NOT_ITS_OWN]
-    return _track(
-        [one.t_ns - zero_ns for one in own],
-        [one.position_m for one in own],
-        [one.orientation_wxyz for one in own],
-        [one.cov for one in own],
-    )
+    return _track(own, [one.cov for one in own], zero_ns)
 
 
-def tracker_track(poses: Iterable[TrackerPose], zero_ns: int) -> PoseTrack:
+def tracker_track(poses: Sequence[TrackerPose], zero_ns: int) -> PoseTrack:
     """Track of the device in its system's frame; where it was lost is a gap."""
-    every = list(poses)
-    return _track(
-        [one.t_ns - zero_ns for one in every],
-        [one.position_m for one in every],
-        [one.orientation_wxyz for one in every],
-        [np.full((6, 6), np.nan)] * len(every),
-    )
+    return _track(poses, [np.full((6, 6), np.nan)] * len(poses), zero_ns)
 
 
-def _track(t_ns: list[int], place: list[Float], quaternion: list[Float], cov: list[Float]) -> PoseTrack:
+def _track(poses: Sequence[ObjectPose | TrackerPose], cov: list[Float], zero_ns: int) -> PoseTrack:
     """A track that rises in time, each time once, without NaN."""
-    times = np.array(t_ns, np.int64)
-    order = np.argsort(times, kind="stable")
-    places = np.array(place, dtype=np.float64).reshape(-1, 3)
-    quaternions = np.array(quaternion, dtype=np.float64).reshape(-1, 4)
+    times, first = np.unique(np.array([one.t_ns for one in poses], np.int64), return_index=True)
+    places = np.array([one.position_m for one in poses], np.float64).reshape(-1, 3)[first]
+    quaternions = np.array([one.orientation_wxyz for one in poses], np.float64).reshape(-1, 4)[first]
     known = np.isfinite(places.sum(axis=1) + quaternions.sum(axis=1))
-    kept = order[known[order]]
-    kept = kept[np.diff(times[kept], prepend=np.iinfo(np.int64).min) > 0] if len(kept) else kept
-    rotation = quaternion_to_matrix(quaternions[kept]) if len(kept) else np.zeros((0, 3, 3))
-    covs = np.array(cov, dtype=np.float64).reshape(-1, 6, 6)
-    return PoseTrack(np.multiply(times[kept], 1e-9, dtype=np.float64), rotation, places[kept], covs[kept])
+    t_s = np.multiply(times[known] - zero_ns, 1e-9, dtype=np.float64)
+    covs = np.array(cov, np.float64).reshape(-1, 6, 6)[first]
+    return PoseTrack(t_s, quaternion_to_matrix(quaternions[known]), places[known], covs[known])
+
+
+def nearest_rotation(matrix: Float) -> Float:
+    """The rotation nearest to a matrix (3, 3)."""
+    left, _, right = np.linalg.svd(matrix)
+    return np.asarray(left @ np.diag([1.0, 1.0, float(np.linalg.det(left @ right))]) @ right)
 
 
 def shared_epochs(seen: PoseTrack, tracker: PoseTrack, late_s: float, most: int) -> Int:
@@ -205,9 +183,7 @@ def coverage_of(seen: PoseTrack, tracker: PoseTrack, late_s: float = 0.0) -> Cov
     if len(rows) < 3:
         return Coverage(*times, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0)
     R, p = seen.R[rows], seen.p_m[rows]
-    total = R.sum(axis=0)
-    left, _, right = np.linalg.svd(total)
-    mean = left @ np.diag([1.0, 1.0, float(np.linalg.det(left @ right))]) @ right
+    mean = nearest_rotation(R.sum(axis=0))
     rotation_vectors = matrix_to_rotation_vector(mean.T @ R)
     rates = _rms_rates(seen, seen.t_s[rows])
     return Coverage(*times, _span(rotation_vectors), _span(p), *rates)

@@ -10,19 +10,17 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from msgspec.structs import replace
 
 from common.arrays import Bool, Float
-from common.calibration import RigCalibration
 from common.calibration.rig import FingerLine
 from common.errors import FitError
 from common.geometry.transforms import intersect_plane
 from common.hand.model import FINGERS
 from common.hand.wrist import laser_plane_of
 from master.calibrate.picture import draw_curls
-from master.calibrate.report import finish
-from master.calibrate.tree_files import provenance, refusals_named
-from master.calibrate.wrist.device import Device, device_of, writes_rig
+from master.calibrate.report import Column, Table, finish
+from master.calibrate.tree_files import refusals_named
+from master.calibrate.wrist.device import Device, device_of, writes_key
 from master.estimator.priors import principal_line
 from master.replay.recorded import recorded_cycles
 
@@ -63,22 +61,22 @@ def fit_curls(laser_m: Float) -> tuple[FingerCurl, ...]:
 def _curl(finger: str, laser_m: Float) -> FingerCurl:
     seen = laser_m[np.isfinite(laser_m).all(axis=1)]
     if len(seen) < MIN_POINTS:
-        reason = f"{len(seen)} points, at least {MIN_POINTS} are needed"
-        return FingerCurl(finger, seen, len(seen), None, reason)
+        return FingerCurl(
+            finger, seen, len(seen), None, f"{len(seen)} points, at least {MIN_POINTS} are needed"
+        )
     points = seen[_on_one_line(seen)]
     axis = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][0]
     moved = float(np.ptp(points @ axis))
     # of 60 to 100 mm: below it was no curl, and a short line's direction is that of the noise
-    min_motion_m = 0.015
-    if len(points) < MIN_POINTS or moved < min_motion_m:
-        reason = (
-            f"moved by {1e3 * moved:.1f} mm, at least {1e3 * min_motion_m:.0f} are needed: bend it to a fist"
-        )
-        return FingerCurl(finger, points, len(seen), None, reason)
-    try:
-        return FingerCurl(finger, points, len(seen), principal_line(points))
-    except FitError as error:
-        return FingerCurl(finger, points, len(seen), None, str(error))
+    least, line, reason = 0.015, None, ""
+    if len(points) < MIN_POINTS or moved < least:
+        reason = f"moved by {1e3 * moved:.1f} mm, at least {1e3 * least:.0f} are needed: bend it to a fist"
+    else:
+        try:
+            line = principal_line(points)
+        except FitError as error:
+            reason = str(error)
+    return FingerCurl(finger, points, len(seen), line, reason)
 
 
 def _on_one_line(points: Float) -> Bool:
@@ -125,49 +123,32 @@ def curl(options: Namespace) -> None:
     laser_m = read_curled(options.detections, device)
     with refusals_named(options.recording):
         curls = fit_curls(laser_m)
-    summary = ", ".join(found.finger for found in curls if found.line is not None)
-    write = writes_rig(device, rig_with_lines(device, curls), f"finger_lines of {summary}")
-    fingers = {found.finger: _json_of(found) for found in curls}
-    finish(options, report_lines(curls), {"fingers": fingers}, partial(draw_curls, curls=curls), write)
+    lines = {found.finger: found.line for found in curls if found.line is not None}
+    residual = {f"{finger}_mm": 1e3 * line.residual_m for finger, line in lines.items()}
+    missing = ", ".join(found.finger for found in curls if found.line is None)
+    note = f"not measured: {missing}" if missing else ""
+    write = writes_key(device, "curl", "finger_lines", device.rig.finger_lines | lines, residual, note)
+    table = curls_table(curls)
+    fingers = dict(zip((found.finger for found in curls), table.json(), strict=True))
+    finish(options, table.lines(), {"fingers": fingers}, partial(draw_curls, curls=curls), write)
 
 
-def report_lines(curls: tuple[FingerCurl, ...]) -> list[str]:
-    """The table for a person."""
-    lines = [f"{'finger':8} {'points':>6} {'left out':>8} {'range mm':>8} {'residual mm':>11}"]
-    for found in curls:
-        left = found.seen - len(found.points_m)
-        text = f"{found.finger:8} {len(found.points_m):6} {left:8}"
-        if found.line is None:
-            lines.append(f"{text}  left out: {found.reason}")
-        else:
-            lines.append(f"{text} {1e3 * found.line.range_m[1]:8.1f} {1e3 * found.line.residual_m:11.2f}")
-    return lines
-
-
-def rig_with_lines(device: Device, curls: tuple[FingerCurl, ...]) -> RigCalibration:
-    """The device's rig with the new lines and where they come from."""
-    lines: dict[str, FingerLine] = {}
-    residual: dict[str, float] = {}
-    for found in curls:
-        if found.line is not None:
-            lines[found.finger] = found.line
-            residual[f"{found.finger}_mm"] = round(1e3 * found.line.residual_m, 4)
-    missing = [found.finger for found in curls if found.line is None]
-    note = f"not measured: {', '.join(missing)}" if missing else ""
-    how = provenance("calibrate wrist curl", (device.source,), residual, note)
-    rig = device.rig
-    return replace(
-        rig, finger_lines=rig.finger_lines | lines, provenance=rig.provenance | {"finger_lines": how}
+def curls_table(curls: tuple[FingerCurl, ...]) -> Table:
+    """Points, range and residual of each finger, or why it has no line."""
+    known = [found.line for found in curls]
+    mm = np.array([[np.nan] * 2 if line is None else [line.range_m[1], line.residual_m] for line in known])
+    used = np.array([len(found.points_m) for found in curls])
+    seen = np.array([found.seen for found in curls])
+    return Table(
+        (
+            Column("finger", [found.finger for found in curls]),
+            Column("points", used, "d", key="points"),
+            Column("left out", seen - used, "d"),
+            Column("", seen, key="seen"),
+            Column("range mm", (1e3 * mm[:, 0]).round(4), ".1f", key="range_mm"),
+            Column("residual mm", (1e3 * mm[:, 1]).round(4), ".2f", key="residual_mm"),
+            Column("", [None if line is None else line.origin_m for line in known], key="origin_m"),
+            Column("", [None if line is None else line.direction for line in known], key="direction"),
+            Column(" ", [found.reason and f"left out: {found.reason}" for found in curls], key="refused"),
+        )
     )
-
-
-def _json_of(found: FingerCurl) -> dict[str, object]:
-    summary: dict[str, object] = {"points": len(found.points_m), "seen": found.seen}
-    if found.line is None:
-        return summary | {"refused": found.reason}
-    return summary | {
-        "range_mm": round(1e3 * found.line.range_m[1], 4),
-        "residual_mm": round(1e3 * found.line.residual_m, 4),
-        "origin_m": list(found.line.origin_m),
-        "direction": list(found.line.direction),
-    }

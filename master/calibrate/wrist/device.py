@@ -13,6 +13,7 @@ from typing import TypeVar, cast
 
 import cv2
 import numpy as np
+from msgspec.structs import replace
 
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, RigCalibration, load
@@ -25,7 +26,7 @@ from master.calibrate.cameras.bundle import place_board
 from master.calibrate.cameras.views import ENDINGS, Finder, load_image
 from master.calibrate.observations import thinned
 from master.calibrate.report import Write
-from master.calibrate.tree_files import rig_in_tree, write_rig
+from master.calibrate.tree_files import provenance, rig_in_tree, write_rig
 
 Seen = TypeVar("Seen")
 
@@ -81,6 +82,15 @@ def device_of(source: Path, rig_name: str | None, calibration: Path, out: Path |
 def writes_rig(device: Device, rig: RigCalibration, keys: str) -> Write:
     """Writes the rig file of a device with what was measured under `keys`."""
     return lambda out: {write_rig(out, device.file_name, rig): keys}
+
+
+def writes_key(
+    device: Device, command: str, key: str, value: object, residual: dict[str, float], note: str
+) -> Write:
+    """Writes one key of the rig file, as `calibrate wrist COMMAND` measured it."""
+    how = provenance(f"calibrate wrist {command}", (device.source,), residual, note)
+    rig = replace(device.rig, **{key: value}, provenance=device.rig.provenance | {key: how})
+    return writes_rig(device, rig, key)
 
 
 _NAMED = re.compile(r"(.*?)[-_ .]?(ambient|laser|led|board)", re.IGNORECASE)
@@ -169,7 +179,7 @@ def _named(folder: Path) -> list[LitView]:
 
 
 def board_in_views(views: Sequence[LitView], board: Board) -> Board:
-    """The board as the first view that has it shows it: a ChArUco board in the layout in which it is printed.
+    """The board as the first view shows it: a ChArUco board in the printed layout.
 
     Raises:
         RecordingError: An image cannot be read.
@@ -186,7 +196,7 @@ def board_in_views(views: Sequence[LitView], board: Board) -> Board:
 def of_views(
     views: Sequence[LitView], take: Callable[[LitView], Seen]
 ) -> tuple[dict[str, Seen], dict[str, str]]:
-    """What `take` finds in each view, by name, and the reason (FitError) of every other view."""
+    """What `take` finds in each view, by name, and why (FitError) not in others."""
     found, refused = dict[str, Seen](), dict[str, str]()
     for view in views:
         try:
@@ -220,12 +230,6 @@ class BoardPose:
     centre_m: Float  # (3,) middle of the corners, about which `covariance` rotates
     covariance: Float  # (6, 6) of small rotations [rad] about the camera's axes and shifts [m], in this order
     rms_px: float  # residual of the corners
-
-
-def lens_of_model(optics: CameraModel) -> Float:
-    """A camera's lens (9,) in the order of `bundle.LENS`."""
-    k = optics.matrix
-    return np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2], *optics.distortion])
 
 
 def board_pose(view: LitView, board: Board, optics: CameraModel) -> BoardPose:
@@ -282,7 +286,9 @@ def place_corners(corners_px: Float, board: Board, optics: CameraModel) -> Board
     """
     known = np.isfinite(corners_px[:, 0])
     drawn = board_corners(board)[known]
-    T, rms = place_board(drawn, corners_px[known], lens_of_model(optics))
+    k = optics.matrix
+    lens = np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2], *optics.distortion])
+    T, rms = place_board(drawn, corners_px[known], lens)
     if not rms <= 1.0:  # beyond it, it is another board or another lens
         raise FitError(
             f"corners are off by {rms:.2f} px: the size of the board, its flatness or the intrinsics are wrong"

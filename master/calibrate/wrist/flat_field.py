@@ -14,17 +14,15 @@ in the middle half to two.
 """
 
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import cast
 
 import cv2
 import numpy as np
-from msgspec.structs import replace
 
 from common.arrays import Float, Image, Int
-from common.calibration import RigCalibration
 from common.calibration.rig import FlatField, terms_of
 from common.errors import FitError
 from common.geometry.camera_model import CameraModel
@@ -34,10 +32,9 @@ from master.calibrate.adjust import Normal, cauchy, minimise
 from master.calibrate.cameras.boards import Board, board_in, grid_shape
 from master.calibrate.picture import draw_flat_field
 from master.calibrate.report import finish
-from master.calibrate.tree_files import provenance, refusals_named
+from master.calibrate.tree_files import refusals_named
 from master.calibrate.wrist.device import (
     BoardPose,
-    Device,
     LitView,
     board_in_views,
     board_pose,
@@ -45,19 +42,14 @@ from master.calibrate.wrist.device import (
     grouped_by_reason,
     lit_views,
     of_views,
-    writes_rig,
+    writes_key,
 )
 
 _STEEPEST = np.cos(np.radians(60.0))  # paper is no Lambertian beyond
 _WITHIN = np.array([-0.22, 0.0, 0.22])  # of a square from its middle: clear of blurred borders
 _DEGREE = 6
 _GRID = (24, 32)
-_CELLS = (3, 3)
-_PLACES = (
-    ("top left", "top", "top right"),
-    ("left", "middle", "right"),
-    ("bottom left", "bottom", "bottom right"),
-)
+_PLACES = ["top left", "top", "top right", "left", "middle", "right", "bottom left", "bottom", "bottom right"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +88,8 @@ def white_samples(
     height, width = led.shape
     inside = ((uv >= 2) & (uv <= np.array([width, height]) - 3.0)).all(axis=1)
     points, uv = points[inside], uv[inside]
-    level = _at(_smooth(led) - _smooth(ambient), uv)
+    above = led.astype(np.float64) - ambient
+    level = _at(np.asarray(cv2.blur(above, (3, 3)), np.float64), uv)
     too_bright = _at(cast(Image, cv2.dilate(led, np.ones((3, 3), np.uint8))), uv) >= 250
     way = points[:, None] - led_m
     square = (way**2).sum(axis=2)
@@ -127,11 +120,6 @@ def _squares(board: Board, placed: BoardPose, optics: CameraModel, led: Image) -
     return at, np.flatnonzero(odd == int(np.argmax(light))).astype(np.int64)
 
 
-def _smooth(image: Image) -> Float:
-    """Means of 3 x 3 pixels (H, W)."""
-    return np.asarray(cv2.blur(image.astype(np.float64), (3, 3)), np.float64)
-
-
 def _at(image: Float | Image, uv: Float) -> Float:
     """Values (n,) of the nearest pixels; NaN outside."""
     height, width = image.shape
@@ -140,13 +128,6 @@ def _at(image: Float | Image, uv: Float) -> Float:
     found = np.full(len(uv), np.nan)
     found[inside] = image[v[inside].astype(int), u[inside].astype(int)]
     return found
-
-
-def gathered(views: Sequence[tuple[Float, Float, Float]]) -> WhiteSamples:
-    """Samples of all views together."""
-    count = [len(light) for _, _, light in views]
-    xy, uv, light = (np.concatenate([view[k] for view in views]) for k in range(3))
-    return WhiteSamples(xy, uv, light, np.repeat(np.arange(len(views)), count).astype(np.int64))
 
 
 def fit_flat_field(samples: WhiteSamples, optics: CameraModel) -> FlatFit:
@@ -220,26 +201,14 @@ def _spread(off: Float) -> float:
 
 
 def _refuse_uncovered(samples: WhiteSamples, size_px: tuple[int, int]) -> None:
-    rows, columns = _CELLS
-    i = np.clip((samples.uv[:, 0] + 0.5) * columns / size_px[0], 0, columns - 1).astype(int)
-    j = np.clip((samples.uv[:, 1] + 0.5) * rows / size_px[1], 0, rows - 1).astype(int)
-    count = np.zeros(_CELLS, dtype=np.int64)
-    np.add.at(count, (j, i), 1)
-    missing = [_PLACES[j][i] for j in range(rows) for i in range(columns) if count[j, i] < 6]  # samples
+    edges = [np.linspace(-0.5, size - 0.5, 4) for size in size_px]
+    count = np.asarray(np.histogram2d(*samples.uv.T, bins=edges)[0].T, np.int64)
+    missing = [name for name, own in zip(_PLACES, count.ravel().tolist(), strict=True) if own < 6]  # samples
     if missing:
         raise FitError(
             f"no white squares at the {', '.join(missing)} of the image: a flat field is needed there too;"
             " show the board there"
         )
-
-
-@dataclass(frozen=True, slots=True)
-class WhiteSeen:
-    """Samples of the views that have some, and of every other view the reason."""
-
-    samples: WhiteSamples
-    views: int
-    refused: Mapping[str, str]
 
 
 def flat_field(options: Namespace) -> None:
@@ -249,24 +218,36 @@ def flat_field(options: Namespace) -> None:
     leds = np.array(device.rig.led) if device.rig.led else np.zeros((1, 3))
     with refusals_named(options.source):
         board = board_in_views(views, board_in(options))
-    seen = white_of(views, board, device.optics, leds)
-    with refusals_named(options.source, grouped_by_reason(seen.refused)):
-        fit = fit_flat_field(seen.samples, device.optics)
+    samples, refused = white_of(views, board, device.optics, leds)
+    reasons, used = grouped_by_reason(refused), len(views) - len(refused)
+    with refusals_named(options.source, reasons):
+        fit = fit_flat_field(samples, device.optics)
+    residual = {"rms_percent": 100 * fit.rms, "cross_validated_rms_percent": 100 * fit.cross_validated_rms}
     report: dict[str, object] = {
         "coefficients": list(fit.field.coefficients),
-        "rms_percent": round(100 * fit.rms, 4),
-        "cross_validated_rms_percent": round(100 * fit.cross_validated_rms, 4),
-        "samples": len(seen.samples.light),
-        "views": seen.views,
-        "refused": dict(seen.refused),
+        **{name: round(value, 4) for name, value in residual.items()},
+        "samples": len(samples.light),
+        "views": used,
+        "refused": refused,
     }
-    lines = report_lines(fit, seen, len(views), known_leds=bool(device.rig.led))
-    draw = partial(draw_flat_field, fit=fit, samples=seen.samples, optics=device.optics)
-    finish(options, lines, report, draw, writes_rig(device, rig_with_field(device, fit, seen), "flat_field"))
+    lines = [
+        f"flat field from {len(samples.light)} samples in {used} of {len(views)} views",
+        f"  residual {100 * fit.rms:.2f} % rms; of views left out of the fit {100 * fit.cross_validated_rms:.2f} %",
+    ]
+    if not device.rig.led:
+        lines.append("  the rig has no `led`: the LEDs were taken to be at the lens")
+    if refused:
+        lines += [f"left out ({len(refused)}):", *(f"  {reason}" for reason in reasons)]
+    note = f"{len(samples.light)} samples of white squares in {used} views"
+    write = writes_key(device, "flat-field", "flat_field", fit.field, residual, note)
+    draw = partial(draw_flat_field, fit=fit, samples=samples, optics=device.optics)
+    finish(options, lines, report, draw, write)
 
 
-def white_of(views: tuple[LitView, ...], board: Board, optics: CameraModel, led_m: Float) -> WhiteSeen:
-    """White squares of every view.
+def white_of(
+    lit: Sequence[LitView], board: Board, optics: CameraModel, led_m: Float
+) -> tuple[WhiteSamples, dict[str, str]]:
+    """White squares of every view, and why others show none.
 
     Raises:
         RecordingError: An image cannot be read.
@@ -278,34 +259,8 @@ def white_of(views: tuple[LitView, ...], board: Board, optics: CameraModel, led_
         assert ambient is not None
         return white_samples(led, ambient, board_pose(view, board, optics), board, optics, led_m)
 
-    found, refused = of_views(views, of)
-    samples = gathered(tuple(found.values()) or [(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))])
-    return WhiteSeen(samples, len(found), refused)
-
-
-def report_lines(fit: FlatFit, seen: WhiteSeen, views: int, *, known_leds: bool) -> list[str]:
-    """The result for a person."""
-    lines = [
-        f"flat field from {len(seen.samples.light)} samples in {seen.views} of {views} views",
-        f"  residual {100 * fit.rms:.2f} % rms; of views left out of the fit {100 * fit.cross_validated_rms:.2f} %",
-    ]
-    if not known_leds:
-        lines.append("  the rig has no `led`: the LEDs were taken to be at the lens")
-    if seen.refused:
-        lines += [
-            f"left out ({len(seen.refused)}):",
-            *(f"  {reason}" for reason in grouped_by_reason(seen.refused)),
-        ]
-    return lines
-
-
-def rig_with_field(device: Device, fit: FlatFit, seen: WhiteSeen) -> RigCalibration:
-    """The device's rig with the flat field and where it comes from."""
-    residual = {
-        "rms_percent": round(100 * fit.rms, 4),
-        "cross_validated_rms_percent": round(100 * fit.cross_validated_rms, 4),
-    }
-    note = f"{len(seen.samples.light)} samples of white squares in {seen.views} views"
-    how = provenance("calibrate wrist flat-field", (device.source,), residual, note)
-    rig = device.rig
-    return replace(rig, flat_field=fit.field, provenance=rig.provenance | {"flat_field": how})
+    found, refused = of_views(lit, of)
+    views = list(found.values()) or [(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))]
+    xy, uv, light = (np.concatenate(part) for part in zip(*views, strict=True))
+    number = np.repeat(np.arange(len(views)), [len(view[2]) for view in views]).astype(np.int64)
+    return WhiteSamples(xy, uv, light, number), refused

@@ -68,9 +68,8 @@ def line_on_board(
     point, along = _brightest_line(flat - background, at, noise, 1.5 * texel_m)
     # Of a profile to both sides: beyond the light of a broad line as well.
     reach_px = max(8.0, 4.0 * _half_width_px(flat - background, at, point, along, pixel_m))
-    coarse = _profiles(light, point, along, pixel_m, noise, placed, reach_px)
-    found = _profiles(light, coarse.point, coarse.along, pixel_m, noise, placed, reach_px)
-    return BoardLine(found.points_m, optics.project(found.points_m), found.sigma_px, found.rms_px)
+    point, along, _ = _profiles(light, point, along, pixel_m, noise, placed, reach_px)
+    return _profiles(light, point, along, pixel_m, noise, placed, reach_px)[2]
 
 
 def _texels(board: Board, pixel_m: float) -> tuple[Float, float]:
@@ -98,7 +97,11 @@ class _BoardLight:
     def __call__(self, xy: Float) -> Float:
         """Levels (...) at places (..., 2) [m]; NaN: outside, or not known."""
         flat = np.concatenate([xy, np.zeros((*xy.shape[:-1], 1))], axis=-1)
-        values = _sampled(self.image, self.optics.project(transform(self.T_camera_board, flat)))
+        u, v = np.moveaxis(self.optics.project(transform(self.T_camera_board, flat)), -1, 0)
+        grey = self.image
+        values = np.asarray(
+            map_coordinates(grey, [v, u], order=1, cval=np.nan, output=np.float64), np.float64
+        )
         if self.squares is None:
             return values
         cell, terms, clear = self._in_squares(xy)
@@ -191,26 +194,14 @@ def _brightest_line(values: Float, at: Float, noise: float, within_m: float) -> 
 
 
 def _half_width_px(values: Float, at: Float, point: Float, along: Float, pixel_m: float) -> float:
-    """How far from a line its light falls to a half, from levels (n,) at places (n, 2)."""
+    """How far from a line its light falls to a half, by levels (n,) at (n, 2)."""
     most_px = 40
     off = np.abs((at - point) @ [-along[1], along[0]]) / pixel_m
     near = off < most_px
     bins = off[near].astype(np.int64)
-    count = np.maximum(np.bincount(bins, minlength=most_px), 1)
-    mean = np.bincount(bins, values[near], most_px) / count
+    mean = np.bincount(bins, values[near], most_px) / np.maximum(np.bincount(bins, minlength=most_px), 1)
     low = mean < 0.5 * mean[0]
     return float(np.argmax(low)) if low.any() else float(most_px)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Centred:
-    """Line on the board: point and direction (2,), points (n, 3) [m], uncertainty."""
-
-    point: Float
-    along: Float
-    points_m: Float
-    sigma_px: float
-    rms_px: float
 
 
 def _profiles(
@@ -221,8 +212,11 @@ def _profiles(
     noise: float,
     placed: BoardPose,
     reach_px: float,
-) -> _Centred:
-    """Centre the line in profiles a pixel apart, and fit a straight line to that."""
+) -> tuple[Float, Float, BoardLine]:
+    """Centre the line in profiles a pixel apart, and fit a straight line to that.
+
+    Returns a point and direction (2,) of it on the board, and the line.
+    """
     board = light.board
     rows, columns = grid_shape(board)
     side = board.square_m
@@ -288,10 +282,5 @@ def _profiles(
     tilted = along + slope * pixel_m * across
     line_floor_px = 0.015  # of a line's place: speckle and paper that no number of profiles averages out
     sigma = float(np.hypot(rms / np.sqrt(kept.sum()), line_floor_px))
-    return _Centred(point + shift * pixel_m * across, tilted / np.linalg.norm(tilted), points, sigma, rms)
-
-
-def _sampled(image: Grey, uv: Float) -> Float:
-    """Values (...) of a float image (H, W) at uv (..., 2), interpolated; NaN outside."""
-    u, v = np.moveaxis(uv, -1, 0)
-    return np.asarray(map_coordinates(image, [v, u], order=1, cval=np.nan, output=np.float64), np.float64)
+    line = BoardLine(points, light.optics.project(points), sigma, rms)
+    return point + shift * pixel_m * across, tilted / np.linalg.norm(tilted), line

@@ -10,6 +10,7 @@ well, and what is not known to a tenth of a degree and of a millimetre is refuse
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from dataclasses import replace as replaced
 from functools import partial
 from itertools import combinations
 
@@ -17,7 +18,6 @@ import numpy as np
 from msgspec.structs import replace
 
 from common.arrays import Bool, Float
-from common.calibration import RigCalibration
 from common.calibration.rig import LASER_ACROSS, LaserPlane
 from common.command_line import UsageError, echo
 from common.errors import FitError
@@ -27,8 +27,8 @@ from common.recording.frame_recording import Illumination
 from master.calibrate.adjust import Normal, minimise
 from master.calibrate.cameras.boards import Board, board_in
 from master.calibrate.picture import draw_cloud, draw_plane
-from master.calibrate.report import finish
-from master.calibrate.tree_files import provenance, refusals_named
+from master.calibrate.report import Write, finish
+from master.calibrate.tree_files import refusals_named
 from master.calibrate.wrist.device import (
     BoardPose,
     Device,
@@ -40,7 +40,7 @@ from master.calibrate.wrist.device import (
     lit_views,
     of_views,
     place_corners,
-    writes_rig,
+    writes_key,
 )
 from master.calibrate.wrist.laser_line import BoardLine, line_on_board
 
@@ -201,7 +201,8 @@ def _fit_of(lines: Lines, used: Bool, normal: Float, offset: float, cov: Float) 
     off = lines.off(normal, offset)
     count = np.array([len(one) for one in lines.points_m])
     rms = float(np.sqrt((count * off**2)[used].sum() / count[used].sum()))
-    plane = LaserPlane(normal=_vector(normal), offset_m=round(float(offset), 9))
+    x, y, z = normal.round(9).tolist()
+    plane = LaserPlane(normal=(x, y, z), offset_m=round(float(offset), 9))
     return PlaneFit(plane, cov * max(1.0, reduced), rms, used, off)
 
 
@@ -279,32 +280,15 @@ def _refuse_unsure(fit: PlaneFit, points: Float) -> None:
         return
     wide = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
     if wide[1] < max(5.0 * fit.rms_m, 0.1 * wide[0]):
-        raise FitError(_collinear(wide[1]))
+        raise FitError(
+            f"all points of the laser lie on one line (they spread {1e3 * wide[1]:.1f} mm across it): they define no"
+            " plane; hold the board at other distances too, and turn it, so that the line falls elsewhere"
+        )
     raise FitError(
         f"the plane is known to {np.degrees(fit.normal_sigma_rad):.2f} deg and {1e3 * fit.offset_sigma_m:.2f} mm only"
         f" (limits {np.degrees(NORMAL_LIMIT_RAD):.1f} deg, {1e3 * limit_m:.1f} mm): show the board in more"
         " views, nearer and farther, so large that it fills a third of the image"
     )
-
-
-def _collinear(wide_m: float) -> str:
-    return (
-        f"all points of the laser lie on one line (they spread {1e3 * wide_m:.1f} mm across it): they define no plane;"
-        " hold the board at other distances too, and turn it, so that the line falls elsewhere"
-    )
-
-
-def _vector(value: Float) -> tuple[float, float, float]:
-    x, y, z = (round(float(number), 9) for number in value)
-    return x, y, z
-
-
-@dataclass(frozen=True, slots=True)
-class LinesSeen:
-    """Lines of the views that show one, and of every other view the reason."""
-
-    lines: tuple[ViewLine, ...]
-    refused: Mapping[str, str]
 
 
 def laser_plane(options: Namespace) -> None:
@@ -320,13 +304,16 @@ def laser_plane(options: Namespace) -> None:
     views = lit_views(options.source, device.camera.name, Illumination.LASER)
     with refusals_named(options.source):
         board = board_in_views(views, board_in(options))
-    seen = lines_of(views, board, device.optics)
-    with refusals_named(options.source, grouped_by_reason(seen.refused)):
-        fit = fit_plane(seen.lines)
+    lines, refused = lines_of(views, board, device.optics)
+    with refusals_named(options.source, grouped_by_reason(refused)):
+        fit = fit_plane(lines)
     note = f"{int(fit.used.sum())} of {len(fit.used)} views of a board"
-    write = writes_rig(device, rig_with_plane(device, fit, note), "laser_plane")
-    draw = partial(draw_plane, fit=fit, lines=seen.lines, optics=device.optics)
-    finish(options, report_lines(fit, seen, len(views)), report_json(fit, seen), draw, write)
+    write = writes_plane(device, fit, note)
+    draw = partial(draw_plane, fit=fit, lines=lines, optics=device.optics)
+    own = zip(lines, (1e3 * fit.off_m).round(6).tolist(), fit.used.tolist(), strict=True)
+    about = {one.name: {"rms_mm": mm, "used": used, "points": len(one.points_m)} for one, mm, used in own}
+    numbers = plane_json(fit) | {"views": about, "refused": refused}
+    finish(options, report_lines(fit, lines, refused), numbers, draw, write)
 
 
 def _of_cloud(options: Namespace) -> None:
@@ -346,20 +333,22 @@ def _of_cloud(options: Namespace) -> None:
             f" {1e3 * _OFFSET_LIMIT_M:.1f} mm)"
         )
     over = {} if found.over_all is None else {"over_all": plane_json(found.over_all)}
-    write = writes_rig(device, rig_with_plane(device, fit, used), "laser_plane")
+    write = writes_plane(device, fit, used)
     own = np.repeat(fit.used, [len(p) for p in found.lines.points_m])
     draw = partial(draw_cloud, fit=fit, points_m=points, used=own)
     finish(options, lines, plane_json(fit) | {"points": len(points)} | over, draw, write)
 
 
-def lines_of(views: tuple[LitView, ...], board: Board, optics: CameraModel) -> LinesSeen:
-    """The laser's line on the board of every view.
+def lines_of(
+    views: tuple[LitView, ...], board: Board, optics: CameraModel
+) -> tuple[tuple[ViewLine, ...], dict[str, str]]:
+    """The laser's line on the board of every view, and why others show none.
 
     Raises:
         RecordingError: An image cannot be read.
     """
     found, refused = of_views(views, lambda view: _line_of(view, board, optics))
-    return LinesSeen(tuple(found.values()), refused)
+    return tuple(found.values()), refused
 
 
 def _line_of(view: LitView, board: Board, optics: CameraModel) -> ViewLine:
@@ -382,22 +371,22 @@ def _line_of(view: LitView, board: Board, optics: CameraModel) -> ViewLine:
     return ViewLine.of(view.name, line, placed, float(np.sqrt(optics.matrix[0, 0] * optics.matrix[1, 1])))
 
 
-def report_lines(fit: PlaneFit, seen: LinesSeen, views: int) -> list[str]:
+def report_lines(fit: PlaneFit, seen: Sequence[ViewLine], refused: Mapping[str, str]) -> list[str]:
     """The result for a person."""
-    used = int(fit.used.sum())
-    points = sum(len(line.points_m) for line, own in zip(seen.lines, fit.used, strict=True) if own)
+    used, views = int(fit.used.sum()), len(seen) + len(refused)
+    points = sum(len(line.points_m) for line, own in zip(seen, fit.used, strict=True) if own)
     lines = [
         f"laser plane from {points} points in {used} of {views} views, {1e3 * fit.rms_m:.3f} mm rms from it",
         *_plane_lines(fit),
     ]
     wrong = [
         f"view {line.name}: {1e3 * off:.2f} mm off the plane of the others"
-        for line, own, off in zip(seen.lines, fit.used, fit.off_m, strict=True)
+        for line, own, off in zip(seen, fit.used, fit.off_m, strict=True)
         if not own
     ]
-    if seen.refused or wrong:
-        reasons = (*grouped_by_reason(seen.refused), *wrong)
-        lines += [f"left out ({len(seen.refused) + len(wrong)}):", *(f"  {reason}" for reason in reasons)]
+    if refused or wrong:
+        reasons = (*grouped_by_reason(refused), *wrong)
+        lines += [f"left out ({len(refused) + len(wrong)}):", *(f"  {reason}" for reason in reasons)]
     return lines
 
 
@@ -421,29 +410,18 @@ def plane_json(fit: PlaneFit) -> dict[str, object]:
     }
 
 
-def report_json(fit: PlaneFit, seen: LinesSeen) -> dict[str, object]:
-    """The same for programs."""
-    return plane_json(fit) | {
-        "views": {
-            line.name: {"rms_mm": round(1e3 * float(off), 6), "used": bool(own), "points": len(line.points_m)}
-            for line, own, off in zip(seen.lines, fit.used, fit.off_m, strict=True)
-        },
-        "refused": dict(seen.refused),
-    }
-
-
-def rig_with_plane(device: Device, fit: PlaneFit, note: str) -> RigCalibration:
-    """The device's rig with the new plane and where it comes from."""
-    residual = {
-        "rms_mm": round(1e3 * fit.rms_m, 4),
-        "normal_sigma_deg": round(float(np.degrees(fit.normal_sigma_rad)), 4),
-        "offset_sigma_mm": round(1e3 * fit.offset_sigma_m, 4),
-    }
-    how = provenance("calibrate wrist laser-plane", (device.source,), residual, note)
-    rig, laser = device.rig, device.rig.laser
+def writes_plane(device: Device, fit: PlaneFit, note: str) -> Write:
+    """Writes the plane into the rig file, and leaves out a laser drawn elsewhere."""
+    laser = device.rig.laser
     if laser is not None and laser.forward is not None:
         leaves = abs(sum(a * b for a, b in zip(fit.plane.normal, laser.forward, strict=True)))
         if leaves > LASER_ACROSS:
             echo("laser.origin, forward and right of the rig file lie in another plane, and are left out")
             laser = replace(laser, origin=None, forward=None, right=None)
-    return replace(rig, laser_plane=fit.plane, laser=laser, provenance=rig.provenance | {"laser_plane": how})
+            device = replaced(device, rig=replace(device.rig, laser=laser))
+    residual = {
+        "rms_mm": 1e3 * fit.rms_m,
+        "normal_sigma_deg": float(np.degrees(fit.normal_sigma_rad)),
+        "offset_sigma_mm": 1e3 * fit.offset_sigma_m,
+    }
+    return writes_key(device, "laser-plane", "laser_plane", fit.plane, residual, note)

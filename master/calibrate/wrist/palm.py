@@ -15,10 +15,8 @@ In palm axes (z to the fingers, y out of the back): board x = +x, board y = -z, 
 from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from msgspec.structs import replace
 
 from common.arrays import Float
 from common.calibration import HandProfile, RigCalibration, load
@@ -28,17 +26,16 @@ from common.hand.model import HandModel
 from common.recording.frame_recording import Illumination
 from master.calibrate.cameras.boards import Board, board_in, grid_shape
 from master.calibrate.report import finish
-from master.calibrate.tree_files import matrix_of, print_lines, provenance, refusals_named
+from master.calibrate.tree_files import matrix_of, print_lines, refusals_named
 from master.calibrate.wrist.device import (
     BoardPose,
-    Device,
     board_in_views,
     board_pose,
     device_of,
     grouped_by_reason,
     lit_views,
     of_views,
-    writes_rig,
+    writes_key,
 )
 
 _FLAT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # board axes -> palm axes
@@ -148,28 +145,28 @@ def palm(options: Namespace) -> None:
         1e-3 * options.wrist_mm, 1e-3 * options.aside_mm, 1e-3 * options.depth_mm, model.side_sign
     )
     with refusals_named(options.source):
-        fit = _by_board(options.source, board_in(options), offset, device)
+        views = lit_views(options.source, device.camera.name, Illumination.LED)
+        board = board_in_views(views, board_in(options))
+        placed, refused = of_views(views, lambda view: board_pose(view, board, device.optics))
+        print_lines(f"left out: {reason}" for reason in grouped_by_reason(refused))
+        fit = palm_from_board(tuple(placed.values()), board, offset)
         refuse_elsewhere(fit.T_camera_palm, device.rig)
-    report: dict[str, object] = {
-        "T_camera_palm": fit.T_camera_palm.tolist(),
+    sigma = {
         "rotation_sigma_deg": float(np.degrees(fit.rotation_sigma_rad)),
         "shift_sigma_mm": 1e3 * fit.shift_sigma_m,
+    }
+    report: dict[str, object] = {
+        "T_camera_palm": fit.T_camera_palm.tolist(),
+        **sigma,
         "residual": fit.residual,
     }
-    write = writes_rig(device, rig_with_palm(device, fit), "T_camera_palm")
+    pose = matrix_of(fit.T_camera_palm)
+    write = writes_key(device, "palm", "T_camera_palm", pose, fit.residual | sigma, fit.note)
     finish(options, report_lines(fit), report, None, write)
 
 
-def _by_board(source: Path, board: Board, offset: BoardOffset, device: Device) -> PalmFit:
-    views = lit_views(source, device.camera.name, Illumination.LED)
-    board = board_in_views(views, board)
-    placed, refused = of_views(views, lambda view: board_pose(view, board, device.optics))
-    print_lines(f"left out: {reason}" for reason in grouped_by_reason(refused))
-    return palm_from_board(tuple(placed.values()), board, offset)
-
-
 def refuse_elsewhere(T_camera_palm: Float, rig: RigCalibration) -> None:
-    """Refuse a palm far from where the rig file has it: another size of board or square shows nowhere else."""
+    """Refuse a palm far from where the rig file has it, as by another size of square."""
     if rig.T_camera_palm is None:
         return
     moved = T_camera_palm @ invert(np.array(rig.T_camera_palm))
@@ -196,16 +193,3 @@ def report_lines(fit: PalmFit) -> list[str]:
         f"  ± {np.degrees(fit.rotation_sigma_rad):.2f} deg, ± {1e3 * fit.shift_sigma_m:.2f} mm",
         "  " + ", ".join(f"{name} {value:g}" for name, value in fit.residual.items()),
     ]
-
-
-def rig_with_palm(device: Device, fit: PalmFit) -> RigCalibration:
-    """The device's rig with the new pose and where it comes from."""
-    residual = fit.residual | {
-        "rotation_sigma_deg": round(float(np.degrees(fit.rotation_sigma_rad)), 4),
-        "shift_sigma_mm": round(1e3 * fit.shift_sigma_m, 4),
-    }
-    how = provenance("calibrate wrist palm", (device.source,), residual, fit.note)
-    rig = device.rig
-    return replace(
-        rig, T_camera_palm=matrix_of(fit.T_camera_palm), provenance=rig.provenance | {"T_camera_palm": how}
-    )

@@ -63,12 +63,6 @@ class Subject:
         """What was fitted, as changes of the old rig and hand."""
         return Unknown.of(self.fit.x)
 
-    @property
-    def knuckle_sigma_m(self) -> Float:
-        """Standard deviations (4, 3) [m] of knuckles, by palm and hand file together."""
-        by_x = self.model.knuckle_derivatives(self.fit.x)
-        return np.sqrt(np.einsum("fki,ij,fkj->fk", by_x, self.fit.covariance, by_x))
-
 
 def calibrate_subject(
     cycles: Sequence[WristDetections],

@@ -72,15 +72,6 @@ class SubjectModel:
         """(4, 3) of index ... little, camera frame [m]."""
         return transform(self.palm(unknown), self._root[FINGERS] + unknown.knuckle_m)
 
-    def knuckle_derivatives(self, x: Float) -> Float:
-        """Derivatives (4, 3, 26) of the knuckles by the unknowns."""
-        out = np.empty((4, 3, UNKNOWN))
-        nudge = 1e-5
-        for k, step in enumerate(nudge * np.eye(UNKNOWN)):
-            ahead, behind = (self.knuckles(Unknown.of(x + sign * step)) for sign in (1.0, -1.0))
-            out[..., k] = (ahead - behind) / (2.0 * nudge)
-        return out
-
     def __call__(self, x: Float, angles: Float) -> Float:
         """Laser point (across, along) [m] and tip [px] (T, 4, 4); NaN: the laser misses.
 

@@ -164,7 +164,7 @@ def mirrored() -> Measured:
         (mirrored, "axes right-handed, and pictures not mirrored"),
         (
             lambda: (Motion(6).objects()[:50], Motion(6).tracked()),
-            "gave 49 poses, the tracker .* at least 60",
+            "gave 50 poses, the tracker .* at least 60",
         ),
         (
             lambda: with_cameras(lambda _, p: np.full_like(p, np.nan)),

@@ -59,7 +59,7 @@ GOOD = (
 def test_rendered_views_give_the_plane_to_a_tenth_of_a_degree_and_millimetre() -> None:
     seed = 11  # of twelve devices: `bench/wrist/calibration.py`
     views = tuple(view_of(str(k), frames) for k, frames in enumerate(cycles_of(seed, 6)))
-    fit = fit_plane(lines_of(views, BOARD, OPTICS).lines)
+    fit = fit_plane(lines_of(views, BOARD, OPTICS)[0])
     true = plane_of(seed)
     off_deg = angle_deg(np.array(fit.plane.normal), np.array(true.normal))
     off_mm = 1e3 * abs(fit.plane.offset_m - true.offset_m)
@@ -181,7 +181,7 @@ def lit_in_the_laser_frame(seed: int, count: int, *, board_apart: bool) -> tuple
 @pytest.mark.parametrize("board_apart", [False, True])
 def test_a_board_that_is_lit_in_the_laser_frame_needs_no_ambient_one(*, board_apart: bool) -> None:
     seed = 11
-    fit = fit_plane(lines_of(lit_in_the_laser_frame(seed, 6, board_apart=board_apart), BOARD, OPTICS).lines)
+    fit = fit_plane(lines_of(lit_in_the_laser_frame(seed, 6, board_apart=board_apart), BOARD, OPTICS)[0])
     true = plane_of(seed)
     assert fit.used.sum() >= 5  # one is too steep for the finder, by whatever light
     assert angle_deg(np.array(fit.plane.normal), np.array(true.normal)) < 0.05
@@ -193,9 +193,9 @@ def test_a_lit_board_without_a_line_is_refused() -> None:
     views = tuple(
         view_of(str(k), {Illumination.LASER: one[Illumination.LED]}) for k, one in enumerate(frames)
     )
-    seen = lines_of(views, BOARD, OPTICS)
-    assert not seen.lines
-    assert len(seen.refused) == 6
+    lines, refused = lines_of(views, BOARD, OPTICS)
+    assert not lines
+    assert len(refused) == 6
 
 
 def test_a_laser_that_moved_between_the_views_is_refused() -> None:
