@@ -137,8 +137,7 @@ def curls_table(curls: tuple[FingerCurl, ...]) -> Table:
     """Points, range and residual of each finger, or why it has no line."""
     known = [found.line for found in curls]
     mm = np.array([[np.nan] * 2 if line is None else [line.range_m[1], line.residual_m] for line in known])
-    used = np.array([len(found.points_m) for found in curls])
-    seen = np.array([found.seen for found in curls])
+    used, seen = np.array([[len(found.points_m), found.seen] for found in curls]).T
     return Table(
         (
             Column("finger", [found.finger for found in curls]),

@@ -88,8 +88,7 @@ def white_samples(
     height, width = led.shape
     inside = ((uv >= 2) & (uv <= np.array([width, height]) - 3.0)).all(axis=1)
     points, uv = points[inside], uv[inside]
-    above = led.astype(np.float64) - ambient
-    level = _at(np.asarray(cv2.blur(above, (3, 3)), np.float64), uv)
+    level = _at(np.asarray(cv2.blur(led.astype(np.float64) - ambient, (3, 3)), np.float64), uv)
     too_bright = _at(cast(Image, cv2.dilate(led, np.ones((3, 3), np.uint8))), uv) >= 250
     way = points[:, None] - led_m
     square = (way**2).sum(axis=2)
