@@ -25,6 +25,9 @@ Grey = npt.NDArray[np.float32]
 
 _NOISE_TIMES = 6.0
 _MIN_PROFILES = 12
+_ON_BORDER = (
+    "the laser line runs along the border of two rows of squares: shift the board, so that it crosses them"
+)
 _TOO_SHORT = "the laser line is seen on less than a square of the board: let it cross the board's middle"
 
 
@@ -230,11 +233,9 @@ def _profiles(
     border = 0.3  # ... but never more of a square than this
     clear = from_border > min(border_px * pixel_m, border * side)
     s, base = s[inside & clear], base[inside & clear]
-    if 2 * len(s) < inside.sum() or len(s) < _MIN_PROFILES:
-        raise FitError(
-            "the laser line runs along the border of two rows of squares, where the paper and not the light makes"
-            " its shape: shift the board, or turn it, so that the line crosses the squares"
-        )
+    reason = _TOO_SHORT if 2 * len(s) > inside.sum() else _ON_BORDER
+    if len(s) < _MIN_PROFILES:
+        raise FitError(reason)
     step_px = 0.25
     d = np.arange(-reach_px, reach_px + 0.5 * step_px, step_px)
     places = base[:, None] + (d[:, None] * pixel_m) * across
@@ -247,7 +248,7 @@ def _profiles(
         whole = known[:, ~beside].all(axis=1) & (known[:, beside].mean(axis=1) > 0.3)
     s, profile = s[whole], profile[whole]
     if not len(s):
-        raise FitError(_TOO_SHORT)
+        raise FitError(reason)
     level = np.nan_to_num(profile - np.nanmedian(profile[:, beside], axis=1)[:, None])
     # Wider than what is brighter than half of it: on the flat top of a saturated line a narrow one would rest anywhere.
     half = 0.5 * step_px * (level > 0.5 * level.max(axis=1, initial=0.0)[:, None]).sum(axis=1)
@@ -265,7 +266,7 @@ def _profiles(
     good = (np.abs(centre) < 0.5 * reach_px) & (height > _NOISE_TIMES * noise) & (height > 3.0 * flank)
     s, centre = s[good], centre[good]
     if len(s) < _MIN_PROFILES or np.ptp(s) < side:
-        raise FitError(_TOO_SHORT)
+        raise FitError(reason)
     kept = np.ones(len(s), dtype=np.bool_)
     slope = shift = 0.0
     off = centre

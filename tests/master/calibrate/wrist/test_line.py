@@ -72,7 +72,7 @@ def test_a_line_along_the_border_of_two_rows_is_refused() -> None:
     )
     a, b = np.rint(OPTICS.project(ends)).astype(int).tolist()
     cv2.line(laser, a, b, 255, 2)
-    with pytest.raises(FitError, match=r"along the border of two rows .* shift the board"):
+    with pytest.raises(FitError, match=r"along the border of two rows .*: shift the board"):
         line_on_board(laser, frames[AMBIENT], placed, BOARD, OPTICS)
 
 
