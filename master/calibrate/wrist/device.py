@@ -286,8 +286,7 @@ def place_corners(corners_px: Float, board: Board, optics: CameraModel) -> Board
     """
     known = np.isfinite(corners_px[:, 0])
     drawn = board_corners(board)[known]
-    k = optics.matrix
-    lens = np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2], *optics.distortion])
+    lens = np.append(optics.matrix[[0, 1, 0, 1], [0, 1, 2, 2]], optics.distortion)
     T, rms = place_board(drawn, corners_px[known], lens)
     if not rms <= 1.0:  # beyond it, it is another board or another lens
         raise FitError(
