@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.hands.routines import routine
 from common.calibration import HandProfile, load, save
 from common.errors import CalibrationError, PhalanxError, RecordingError
 from common.hand.model import HandModel
 from common.hand.profiles import generated_profile
 from common.recording.recorded_files import write_npz
 from tests.cli import calibrate
-from tests.master.calibrate.hand.routines import routine
 
 
 def run(*options: str) -> str:

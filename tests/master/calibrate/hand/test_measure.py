@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from bench.hands.routines import TIPS, SimulatedRoutine, routine, with_back
 from common.arrays import Float
 from common.calibration import Couplings, HandProfile
 from common.errors import CalibrationError, FitError
@@ -24,7 +25,6 @@ from master.calibrate.hand.measure import (
     report_lines,
 )
 from master.calibrate.hand.observed import Observed
-from tests.master.calibrate.hand.routines import TIPS, SimulatedRoutine, routine, with_back
 
 
 def template(side: str, back: int = 1) -> HandProfile:
