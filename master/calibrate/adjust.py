@@ -1,10 +1,11 @@
 """The adjustment engine: shared unknowns, and own unknowns of each epoch.
 
 A calibration minimises a sum of squared residuals, outliers weighed down by a robust loss, over S shared
-unknowns (lenses, bones, a mounting) and L own unknowns of each of T epochs (the pose of a board, a hand). An
-epoch touches only its own unknowns, so these are eliminated by a sparse factorisation, and the Schur complement
-that is left is the information about the shared ones (Triggs et al., Bundle adjustment - a modern synthesis,
-2000, section 6). Steps are those of Levenberg and Marquardt.
+unknowns (lenses, bones, a mounting) and L own unknowns of each of T epochs (the pose of a board, a hand, the
+coefficients of a curve at a knot). A row touches only those of one epoch, or of a few that follow each other, so
+these are eliminated by a band's Cholesky factors, and the Schur complement that is left is the information about
+the shared ones (Triggs et al., Bundle adjustment - a modern synthesis, 2000, section 6). Steps are those of
+Levenberg and Marquardt.
 
 A calibration is a function `equations(x) -> Normal`, which adds its rows and priors, and a function
 `stepped(x, shared, own) -> x`, which applies a step to its own kind of unknowns (rotations turn, numbers add).
@@ -12,11 +13,11 @@ A calibration is a function `equations(x) -> Normal`, which adds its rows and pr
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar, cast
+from typing import Generic, TypeVar
 
 import numpy as np
-from scipy.sparse import bsr_array, csc_array
-from scipy.sparse.linalg import splu  # pyright: ignore[reportUnknownVariableType]
+from scipy.linalg import solveh_banded  # pyright: ignore[reportUnknownVariableType]
+from scipy.sparse import csr_array
 
 from common.arrays import Bool, Float, Int
 from common.geometry.transforms import rotation_vector_to_matrix
@@ -24,6 +25,16 @@ from common.geometry.transforms import rotation_vector_to_matrix
 X = TypeVar("X")
 Loss = Callable[[Float], tuple[Float, Float]]
 """Of chi squares (...): what they cost, and the weight (...) of their residuals, the derivative of that."""
+
+
+def huber(sigmas: float) -> Loss:
+    """Huber's loss: beyond that many standard deviations the cost is linear."""
+
+    def loss(chi2: Float) -> tuple[Float, Float]:
+        weight = np.minimum(1.0, sigmas / np.sqrt(np.maximum(chi2, 1e-12)))
+        return np.where(weight < 1.0, 2.0 * sigmas * np.sqrt(chi2) - sigmas**2, chi2), weight
+
+    return loss
 
 
 def cauchy(sigmas: float) -> Loss:
@@ -68,14 +79,16 @@ class Normal:
     Attributes:
         cost: Sum of the losses; without a robust loss, chi square.
         shared, gradient: (S, S) information and (S,) half the gradient of the cost.
-        own, mixed, own_gradient: (T, L, L), (T, L, S) and (T, L) of the own unknowns.
+        own: (W, T, L, L): [d, t] couples the own unknowns of epochs t + d (rows) and t (columns).
+        mixed, own_gradient: (T, L, S) and (T, L) of the own unknowns.
     """
 
-    def __init__(self, shared: int, epochs: int = 0, own: int = 0) -> None:
+    def __init__(self, shared: int, epochs: int = 0, own: int = 0, reach: int = 1) -> None:
+        """No rows yet; a row touches own unknowns of `reach` neighbouring epochs (W)."""
         self.cost = 0.0
         self.shared: Float = np.zeros((shared, shared))
         self.gradient: Float = np.zeros(shared)
-        self.own: Float = np.zeros((epochs, own, own))
+        self.own: Float = np.zeros((reach, epochs, own, own))
         self.mixed: Float = np.zeros((epochs, own, shared))
         self.own_gradient: Float = np.zeros((epochs, own))
 
@@ -86,6 +99,7 @@ class Normal:
         own: Float | None = None,
         *,
         epochs: Int | slice = slice(None),
+        weights: Float | None = None,
         columns: Int | slice = slice(None),
         loss: Loss | None = None,
         group: int = 1,
@@ -96,7 +110,9 @@ class Normal:
         Args:
             residual: (E, R) predicted minus observed, in standard deviations; NaN: not observed.
             shared: (E, R, C) derivatives by the shared unknowns `columns`.
-            own: (E, R, L) derivatives by the own unknowns of `epochs` (E,), each at most once.
+            own: (E, R, L) derivatives by the own unknowns of `epochs` (E,).
+            weights: (E, W) by which `own` is the derivative by those of the W epochs from `epochs` on, as of the
+                coefficients of a spline; None: 1, by the epoch alone.
             columns: The C shared unknowns that these rows depend on, each once.
             loss: Robust loss of each `group` of neighbouring residuals, such as both coordinates of a point.
             share: (E,) what an epoch counts, where neighbours in time share their errors.
@@ -110,23 +126,33 @@ class Normal:
         at = columns if isinstance(columns, slice) else np.ix_(columns, columns)
         self.shared[(at, at) if isinstance(at, slice) else at] += flat.T @ flat
         self.gradient[columns] += flat.T @ residual.ravel()
-        if own is not None:
-            back = np.swapaxes(np.where(root > 0.0, own * root, 0.0), 1, 2)
-            self.own[epochs] += back @ np.swapaxes(back, 1, 2)
-            self.own_gradient[epochs] += (back @ residual[..., None])[..., 0]
-            cross = back @ heavy
-            if isinstance(columns, slice):
-                self.mixed[epochs, :, columns] += cross
-            else:
-                mixed = self.mixed[epochs]
-                mixed[..., columns] += cross
-                self.mixed[epochs] = mixed
+        if own is None:
+            return
+        back = np.swapaxes(np.where(root > 0.0, own * root, 0.0), 1, 2)
+        square, cross = back @ np.swapaxes(back, 1, 2), back @ heavy
+        weights = np.ones((count, 1)) if weights is None else weights
+        every: Int = np.arange(self.own.shape[1], dtype=np.int64)
+        first, width = every[epochs], weights.shape[1]
+        for d in range(width):
+            self.own[d] += self._summed(first, weights[:, : width - d] * weights[:, d:], square)
+        self.own_gradient += self._summed(first, weights, (back @ residual[..., None])[..., 0])
+        self.mixed[..., columns] += self._summed(first, weights, cross)
+
+    def _summed(self, first: Int, weights: Float, values: Float) -> Float:
+        """Weighted sums (T, ...) of values (E, ...) that count from epochs `first` on."""
+        epochs: Int = first[:, None] + np.arange(weights.shape[1], dtype=np.int64)
+        rows = np.broadcast_to(np.arange(len(first))[:, None], epochs.shape)
+        shape = len(self.own_gradient), len(first)
+        gather = csr_array((weights.ravel(), (epochs.ravel(), rows.ravel())), shape=shape)
+        total = np.asarray(gather @ values.reshape(len(first), -1), np.float64)
+        return total.reshape(-1, *values.shape[1:])
 
     def hold(self, held: Bool) -> None:
         """Keep own unknowns (T, L) in the next step, as an angle at its limit."""
         moves = np.where(held, 0.0, 1.0)
-        self.own *= moves[:, :, None] * moves[:, None, :]
-        np.einsum("tii->ti", self.own)[...] += held
+        for d, blocks in enumerate(self.own):
+            blocks[: len(moves) - d] *= moves[d:, :, None] * moves[: len(moves) - d, None, :]
+        np.einsum("tii->ti", self.own[0])[...] += held
         self.mixed *= moves[..., None]
         self.own_gradient *= moves
 
@@ -145,16 +171,16 @@ class Normal:
             own unknowns' step is -(the second) - (the first) @ (step of the shared).
 
         Raises:
-            RuntimeError: The own unknowns' equations cannot be solved.
+            LinAlgError: The own unknowns' equations cannot be solved.
         """
         size, (count, length) = len(self.gradient), self.own_gradient.shape
         information = self.shared + damping * np.diag(np.diag(self.shared))
         if not count:
             return information, self.gradient, self.mixed, self.own_gradient
         sides = np.concatenate([self.mixed, self.own_gradient[..., None]], axis=-1).reshape(-1, size + 1)
-        # Positive definite, and in the order of time: no pivots, little fill.
-        how = {"permc_spec": "NATURAL", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
-        solved = np.asarray(cast(Any, splu)(self._matrix(damping), **how).solve(sides), np.float64)
+        solved = np.asarray(
+            solveh_banded(self._band(damping), sides, lower=True, check_finite=False), np.float64
+        )
         back = sides[:, :size].T @ solved
         solved = solved.reshape(count, length, size + 1)
         return (
@@ -164,13 +190,19 @@ class Normal:
             solved[..., size],
         )
 
-    def _matrix(self, damping: float) -> csc_array:
-        """The own unknowns' information (T L, T L), damped."""
-        count, length = self.own_gradient.shape
+    def _band(self, damping: float) -> Float:
+        """The own unknowns' information, damped.
+
+        (W L, T L): row i of column j is [j + i, j] of the matrix.
+        """
+        reach, count, length, _ = self.own.shape
+        out = np.zeros((reach * length, count, length))
+        for d, blocks in enumerate(self.own):
+            row, column = np.nonzero(np.tri(length) if d == 0 else np.ones((length, length)))
+            out[d * length + row - column, :, column] = blocks[:, row, column].T
         nothing = 1e-9  # information of what nothing constrains
-        blocks = self.own + np.eye(length) * (damping * self.own + nothing)
-        shape, at = (count * length, count * length), np.arange(count + 1, dtype=np.int64)
-        return csc_array(bsr_array((blocks, at[:-1], at), shape=shape))
+        out[0] += damping * out[0] + nothing
+        return out.reshape(reach * length, count * length)
 
     def step(self, damping: float) -> tuple[Float, Float] | None:
         """Marquardt's step of shared (S,) and own unknowns (T, L); None: more damping."""
@@ -180,13 +212,13 @@ class Normal:
             scale = _unit_scale(information if damping == 0.0 else self.shared)
             scaled = information * scale[:, None] * scale
             step = -scale * np.asarray(np.linalg.solve(scaled, gradient * scale), np.float64)
-        except (RuntimeError, np.linalg.LinAlgError):
+        except np.linalg.LinAlgError:
             return None
         return step, -by_own - by_shared @ step
 
     def predicted_gain(self, shared: Float, own: Float, damping: float) -> float:
         """By how much a step of this damping would lower the cost if all were linear."""
-        on = np.einsum("tii->ti", self.own)
+        on = np.einsum("tii->ti", self.own[0])
         squares = np.diag(self.shared) @ shared**2 + float((on * own**2).sum())
         return float(damping * squares - self.gradient @ shared - (self.own_gradient * own).sum())
 

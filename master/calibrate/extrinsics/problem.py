@@ -115,7 +115,7 @@ class HandProblem:
             (np.vecdot(pushed - 2.0 * prior.pull, hands.x) + 2.0 * prior.constant).sum()
         )
         normal.own_gradient[:, 6:] += share * (pushed - prior.pull)
-        normal.own[:, 6:, 6:] += share * prior.normal
+        normal.own[0, :, 6:, 6:] += share * prior.normal
 
     def _chains(self, hands: Hands) -> Chains:
         return self.model.chains(self.markers.parameters.angles(hands.x))

@@ -4,9 +4,14 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from master.calibrate.adjust import Loss, Normal, cauchy, geman_mcclure, minimise, tukey
+from master.calibrate.adjust import Loss, Normal, cauchy, geman_mcclure, huber, minimise, tukey
 
-LOSSES = {"cauchy": cauchy(2.0), "geman and mcclure": geman_mcclure(2.0), "tukey": tukey(3.0)}
+LOSSES = {
+    "huber": huber(2.0),
+    "cauchy": cauchy(2.0),
+    "geman and mcclure": geman_mcclure(2.0),
+    "tukey": tukey(3.0),
+}
 
 
 def dense(residual: Float, shared: Float, own: Float) -> tuple[Float, Float]:
@@ -34,6 +39,36 @@ def test_step_and_covariance_are_those_of_the_dense_problem() -> None:
     np.testing.assert_allclose(normal.covariance(), np.linalg.inv(J.T @ J)[:4, :4], rtol=1e-6)
     assert normal.cost == pytest.approx(r @ r)
     assert normal.cost - normal.predicted_gain(*step, 0.0) == pytest.approx(((J @ expected + r) ** 2).sum())
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_rows_of_a_curve_and_links_are_those_of_the_dense_problem(held: bool) -> None:
+    """Rows touch four neighbouring knots, others the change from one knot to the next."""
+    rng = np.random.default_rng(2)
+    rows, knots, n, g, r = 70, 9, 3, 5, 2
+    first, weights = rng.integers(0, knots - 3, rows), rng.normal(size=(rows, 4))
+    residual, shared, own = (rng.normal(size=(rows, r, *tail)) for tail in ((), (g,), (n,)))
+    off, by, change = (rng.normal(size=(knots - 1, r, *tail)) for tail in ((), (g,), (n,)))
+    normal = Normal(g, knots, n, reach=4)
+    normal.add(residual, shared, own, epochs=first, weights=weights)
+    normal.add(off, by, change, epochs=slice(-1), weights=np.tile([-1.0, 1.0], (knots - 1, 1)))
+    J = np.zeros((rows + knots - 1, r, knots, n))
+    for i in range(rows):
+        J[i, :, first[i] : first[i] + 4] = weights[i, :, None] * own[i, :, None]
+    for k in range(knots - 1):
+        J[rows + k, :, k], J[rows + k, :, k + 1] = -change[k], change[k]
+    if held:
+        J[:, :, 4, 1] = 0.0
+        normal.hold(np.arange(knots)[:, None] * [0, 1, 0] == 4)
+    J = np.concatenate([np.concatenate([shared, by]), J.reshape(-1, r, knots * n)], axis=2).reshape(
+        -1, g + knots * n
+    )
+    expected = np.linalg.lstsq(J, -np.concatenate([residual, off]).ravel(), rcond=None)[0]
+    step = normal.step(0.0)
+    assert step is not None
+    np.testing.assert_allclose(np.concatenate([step[0], step[1].ravel()]), expected, atol=1e-7)
+    covariance = np.linalg.pinv(J.T @ J)[:g, :g]
+    np.testing.assert_allclose(normal.covariance(), covariance, rtol=1e-6, atol=1e-9)
 
 
 def test_rows_of_some_epochs_and_some_unknowns_are_added_where_they_belong() -> None:

@@ -62,7 +62,7 @@ def test_the_normal_matrix_is_the_curvature_where_markers_fit() -> None:
     rng = np.random.default_rng(6)
     step = 1e-5 * rng.normal(size=(COUNT, 6 + hands.x.shape[1]))
     here = rows_of(at, hands)
-    curved = np.einsum("ti,tij,tj->", step, here.own, step)
+    curved = np.einsum("ti,tij,tj->", step, here.own[0], step)
     there, back = (rows_of(at, hands.retracted(way * step)).cost for way in (1.0, -1.0))
     np.testing.assert_allclose(0.5 * (there + back - 2.0 * here.cost), curved, rtol=1e-4)
 
