@@ -33,6 +33,7 @@ COMMANDS: dict[str, dict[str, tuple[str, str]]] = {
             "captured hands before ideal markers (PHALANX_MOTION); a hidden tip",
         ),
         "joint_certainty": ("hands.certainty", "95 % regions of joints that are seen, hidden, gone"),
+        "hand_lengths": ("hands.lengths", "fingers by the routine of `calibrate hand`, simulated users"),
         "mocap": ("hands.mocap", "poses against motion capture in another frame and clock"),
         "imu": ("imu", "orientation by rates and forces (BROAD); baseline: VQF"),
     },

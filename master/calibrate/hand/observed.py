@@ -168,10 +168,10 @@ def flat_scale(observed: Observed, model: HandModel) -> float:
     best: list[tuple[float, float]] = []
     for window in _still(points):
         seen = np.isfinite(window[:, 0])
-        a, b = window[seen] - window[seen].mean(axis=0), flat[seen] - flat[seen].mean(axis=0)
-        scale = float(np.sqrt((a**2).sum() / (b**2).sum()))
-        off = window[seen] - transform(fit_rigid(window[seen], scale * flat[seen]), scale * flat[seen])
-        best.append((float((off**2).mean()), scale))
+        own, shown = window[seen] - window[seen].mean(axis=0), flat[seen] - flat[seen].mean(axis=0)
+        shown = transform(fit_rigid(own, shown), shown)  # of a centred hand the rotation is that of any size
+        scale = float((own * shown).sum() / (shown**2).sum())  # |own| / |shown| also counts other proportions
+        best.append((float(((own - scale * shown) ** 2).mean()), scale))
     return min(best)[1]
 
 

@@ -3,7 +3,7 @@
 One shape, and curves of 26 channels: palm rotation (3, rotation vector about the palm's middle, against the
 first pose), palm shift (3), then the angles (20). Deviations from what the routine asks for are
 Ornstein-Uhlenbeck processes: they live for about a second, so that many frames of one bend count as one trial
-and not as many. Solved by damped Gauss-Newton over the whole routine.
+and not as many. The adjustment engine solves it: the shape is shared, each knot owns its coefficients.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,8 @@ from common.arrays import Float
 from common.errors import FitError
 from common.geometry.transforms import rotation_vector_to_matrix, skew, transform
 from common.hand.model import HandModel
-from master.calibrate.hand.curves import BorderedNormal, Knots
+from master.calibrate.adjust import Normal, huber, minimise
+from master.calibrate.hand.curves import Knots
 from master.calibrate.hand.shape import (
     BIAS,
     LENGTH,
@@ -32,6 +33,7 @@ from master.calibrate.hand.shape import (
 CHANNELS = 26
 _PALM, _ANGLES = 6, 20
 _DIP = 3
+_LOSS = huber(3.0)
 _SLACK_RAD = float(np.radians(10.0))  # hands bend farther than the published limits
 
 
@@ -67,35 +69,32 @@ class HandRoutineProblem:
         angles[..., 3] = self.prior.dip_ratio * angles[..., 2]
         return State(self.prior, coefficients)
 
-    def stepped(self, state: State, coefficients: Float, constants: Float) -> State:
+    def stepped(self, state: State, constants: Float, coefficients: Float) -> State:
         """After a step, kept where hands can be."""
         moved = state.coefficients + coefficients
-        low, high = (self.model.limits_rad[..., i].ravel() for i in (0, 1))
-        np.clip(moved[:, _PALM:], low - _SLACK_RAD, high + _SLACK_RAD, out=moved[:, _PALM:])
+        np.clip(moved[:, _PALM:], *self._limits(), out=moved[:, _PALM:])
         return State(state.shape.stepped(constants), moved)
 
-    def normal(self, state: State) -> tuple[BorderedNormal, float]:
-        """Normal equations at a guess, and half the sum of squares there."""
-        size = state.shape.size
-        out = BorderedNormal(len(self.knots.time_s), CHANNELS, size)
-        jacobian, by_shape, off = self._markers(state)
-        seen = weigh(off)
-        rows = len(off), -1
-        scale = np.sqrt(seen)[..., None]
-        off = off * scale
-        out.add_epochs(
-            self.knots,
-            (jacobian * scale[..., None]).reshape(*rows, CHANNELS),
-            (by_shape * scale[..., None]).reshape(*rows, size),
-            off.reshape(rows),
-        )
-        links = self._links(state)
-        out.add_links(*links)
+    def _limits(self) -> tuple[Float, Float]:
+        """Where angles (20,) can be."""
+        limits = self.model.limits_rad.reshape(-1, 2)
+        return limits[:, 0] - _SLACK_RAD, limits[:, 1] + _SLACK_RAD
+
+    def equations(self, state: State) -> Normal:
+        """Normal equations at a guess; angles at their limits are held."""
+        knots, x, size = self.knots, state.coefficients, state.shape.size
+        normal = Normal(size, len(x), CHANNELS, reach=4)
+        by_curve, by_shape, off = self._markers(state)
+        normal.add(off, by_shape, by_curve, epochs=knots.first, weights=knots.weight, loss=_LOSS, group=3)
+        self._add_curve_priors(normal, state)
         weight, away = self._shape_prior(state.shape)
-        out.corner += np.diag(weight**2)
-        out.pull_constants -= weight**2 * away
-        cost = 0.5 * (float((off**2).sum() + (links[2] ** 2).sum()) + float(((weight * away) ** 2).sum()))
-        return out, cost
+        normal.add_prior(away, 1.0 / weight)
+        held = np.zeros(x.shape, np.bool_)
+        low, high = self._limits()
+        angles = x[:, _PALM:]
+        held[:, _PALM:] = np.where(normal.own_gradient[:, _PALM:] > 0.0, angles <= low, angles >= high)
+        normal.hold(held)
+        return normal
 
     def residuals(self, state: State) -> Float:
         """(T, 5 + B, 3) [m] observed less predicted, NaN where not seen."""
@@ -136,43 +135,51 @@ class HandRoutineProblem:
         return predicted, by_curve, by_shape
 
     def _markers(self, state: State) -> tuple[Float, Float, Float]:
-        """Whitened Jacobians and differences; 0 where nothing was seen."""
+        """Whitened Jacobians by curves and shape; predicted less observed, NaN: not seen."""
         predicted, by_curve, by_shape = self._predicted(state)
-        off = np.nan_to_num(self.points_m - predicted)
-        return self.whiten @ by_curve, self.whiten @ by_shape, (self.whiten @ off[..., None])[..., 0]
+        off = self.whiten @ (predicted - self.points_m)[..., None]
+        rows = len(off), -1
+        by_curve, by_shape = (self.whiten @ by_curve).reshape(*rows, CHANNELS), self.whiten @ by_shape
+        return by_curve, by_shape.reshape(*rows, state.shape.size), off.reshape(rows)
 
-    def _links(self, state: State) -> tuple[Float, Float, Float]:
-        """Residual rows between neighbouring coefficients.
-
-        Palm, angles about the routine, DIPs about their PIPs.
-        """
+    def _add_curve_priors(self, normal: Normal, state: State) -> None:
+        """Add priors of palm, angles about the routine and DIPs about their PIPs."""
         x, shape = state.coefficients, state.shape
         change, mean, level = self._widths()
+        lever, by_lever = self._levers(shape)
         dip = _PALM + np.arange(5) * 4 + _DIP
-        pip = dip - 1
-        plain = np.setdiff1d(np.arange(CHANNELS), dip)
-        count, rows = len(x) - 1, 2 * CHANNELS
-        jacobian = np.zeros((count, rows, 2, CHANNELS))
-        by_shape = np.zeros((count, rows, shape.size))
-        off = np.zeros((count, rows))
-        for c in plain:
-            jacobian[:, c, 0, c], jacobian[:, c, 1, c] = -change[:, c], change[:, c]
-            off[:, c] = -change[:, c] * (x[1:, c] - x[:-1, c])
-            jacobian[:, CHANNELS + c, 0, c] = level[:, c]
-            off[:, CHANNELS + c] = level[:, c] * (mean[:, c] - x[:-1, c])
-        outlier = x[:, dip] - shape.dip_ratio * x[:, pip] - shape.dip_bias_rad
-        for f, (d, p) in enumerate(zip(dip, pip, strict=True)):
-            ratio, own = shape.dip_ratio[f], PER_FINGER * f
-            jacobian[:, d, 0, d], jacobian[:, d, 1, d] = -change[:, d], change[:, d]
-            jacobian[:, d, 0, p], jacobian[:, d, 1, p] = ratio * change[:, d], -ratio * change[:, d]
-            by_shape[:, d, own + RATIO] = -change[:, d] * (x[1:, p] - x[:-1, p])
-            off[:, d] = -change[:, d] * (outlier[1:, f] - outlier[:-1, f])
-            row = CHANNELS + d
-            jacobian[:, row, 0, d], jacobian[:, row, 0, p] = level[:, d], -ratio * level[:, d]
-            by_shape[:, row, own + RATIO] = -level[:, d] * x[:-1, p]
-            by_shape[:, row, own + BIAS] = -level[:, d]
-            off[:, row] = -level[:, d] * outlier[:-1, f]
-        return jacobian, by_shape, off
+        pip, own = dip - 1, np.arange(5) * PER_FINGER
+        about = x.copy()  # the curves; of a DIP what its PIP does not account for
+        about[:, dip] -= shape.dip_ratio * x[:, pip]
+        by_curve = np.tile(np.eye(CHANNELS), (len(change), 1, 1))
+        by_curve[:, dip, pip] = -shape.dip_ratio
+        changed = np.diff(about, axis=0)
+        by_change, by_level = changed[..., None] * by_lever, np.zeros((len(change), *by_lever.shape))
+        by_change[:, dip, own + RATIO] = -lever[dip] * np.diff(x[:, pip], axis=0)
+        by_level[:, dip, own + RATIO], by_level[:, dip, own + BIAS] = -x[:-1, pip], -1.0
+        mean[:, dip] = shape.dip_bias_rad
+        neighbours = np.tile([-1.0, 1.0], (len(change), 1))
+        for off, by_shape, by, sharpness, weights in (
+            (lever * changed, by_change, lever[:, None] * by_curve, change, neighbours),
+            (about[:-1] - mean, by_level, by_curve, level, None),
+        ):
+            share = sharpness[..., None]
+            normal.add(sharpness * off, share * by_shape, share * by, epochs=slice(-1), weights=weights)
+
+    def _levers(self, shape: Shape) -> tuple[Float, Float]:
+        """Lengths (26,) that channels turn, as shares of the prior's; (26, size) by the shape.
+
+        The priors of changes are about the way of a tip, not about angles: else a longer bone, that follows the
+        noise by smaller angles, would cost less, and all would come out long (Neyman & Scott, 1948).
+        """
+        lever, by_shape = np.ones(CHANNELS), np.zeros((CHANNELS, shape.size))
+        for f in range(5):
+            for angle, bone in enumerate((0, 0, 1, 2)):  # the first bone that it turns
+                usual_m = self.prior.length_m[f, bone:].sum()
+                row, own = _PALM + 4 * f + angle, PER_FINGER * f
+                lever[row] = shape.length_m[f, bone:].sum() / usual_m
+                by_shape[row, own + bone : own + 3] = 1.0 / usual_m
+        return lever, by_shape
 
     def _widths(self) -> tuple[Float, Float, Float]:
         """Inverse sd of changes, means, inverse sd of levels, each (K - 1, 26)."""
@@ -191,7 +198,8 @@ class HandRoutineProblem:
         pip = 2
         means[..., pip] = np.where(straight, b.straight_rad[0], means[..., pip])
         sigmas[..., pip] = np.where(straight, b.straight_rad[1], sigmas[..., pip])
-        dip = np.array([b.thumb_dip_rad, *[b.dip_rad] * 4])
+        dip = np.tile([b.thumb_dip_rad, *[b.dip_rad] * 4], (count, 1))
+        dip[:, 1:] = np.where(straight[:, 1:], b.straight_dip_rad, dip[:, 1:])
         angles[..., _DIP], sigmas[..., _DIP] = dip * np.sqrt(2.0 / b.slow_s), dip
         return 1.0 / (wander * np.sqrt(h)), mean, np.sqrt(h / (2.0 * b.slow_s)) / sigma
 
@@ -212,12 +220,6 @@ class HandRoutineProblem:
         return 1.0 / sd, away
 
 
-def weigh(whitened: Float) -> Float:
-    """Huber's weights (...) of whitened differences (..., 3)."""
-    outlier = 3.0  # whitened length from which a marker counts less (Huber)
-    return np.minimum(1.0, outlier / np.maximum(np.linalg.norm(whitened, axis=-1), 1e-12))
-
-
 def _rotation_between(rotation: Float, other: Float) -> Float:
     """(5, 3) small turns about the palm's axes from `other` to `rotation` (5, 3, 3)."""
     r = rotation @ np.swapaxes(other, -1, -2)
@@ -229,9 +231,6 @@ def _left_jacobian(vector: Float) -> Float:
     angle = np.maximum(np.linalg.norm(vector, axis=-1), 1e-6)[:, None, None]
     k = skew(vector)
     return np.eye(3) + (1 - np.cos(angle)) / angle**2 * k + (angle - np.sin(angle)) / angle**3 * (k @ k)
-
-
-_REFUSED = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -256,33 +255,21 @@ def fit_shape(
     Raises:
         FitError: The search does not settle.
     """
-    state, settled = problem.guess(), False
-    normal, cost = problem.normal(state)
-    damping, taken, refused = 1e-3, 0, 0
-    steps = 40
-    while taken < steps and refused < _REFUSED:
-        coefficients, constants, _ = normal.solve(damping)
-        tried = problem.stepped(state, coefficients, constants)
-        next_normal, next_cost = problem.normal(tried)
-        if next_cost < cost:
-            gain, state, normal, cost = cost - next_cost, tried, next_normal, next_cost
-            damping, taken, refused = max(damping / 5.0, 1e-9), taken + 1, 0
-            progress(min(taken / 15.0, 0.99))
-            settled = gain < 0.05  # tolerance of half chi square, against thousands
-            if settled:
-                break
-        else:
-            damping, refused = damping * 8.0, refused + 1
-    if not settled and refused < _REFUSED:
+    steps, gain = 60, 0.1  # gain in chi square, against thousands
+    found = minimise(
+        problem.equations, problem.stepped, problem.guess(), steps=steps, gain=gain, progress=progress
+    )
+    if not found.settled:
         raise FitError(
             f"the fit does not settle in {steps} steps: the palm did not rest, or it is not this routine or hand;"
             " record it again, or begin with --length-mm"
         )
+    state = found.x
     residual = problem.residuals(state)
     spread, alike = _spread(problem, residual)
-    cov = np.asarray(np.linalg.inv(normal.solve(0.0)[2]), np.float64) * (max(spread, 1.0) * alike) ** 2
+    cov = found.normal.covariance() * (max(spread, 1.0) * alike) ** 2
     moved = state.coefficients[:, :6]
-    return ShapeFit(state.shape, cov, residual, problem.angles(state), moved, spread, alike, taken)
+    return ShapeFit(state.shape, cov, residual, problem.angles(state), moved, spread, alike, found.steps)
 
 
 def _spread(problem: HandRoutineProblem, residual_m: Float) -> tuple[float, float]:

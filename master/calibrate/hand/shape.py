@@ -127,8 +127,8 @@ class Priors:
     """Standard deviations."""
 
     # of one bone about its share of the hand length, as a share of its length. Individuals spread by 5 to 8 %
-    # (Buchholz, Armstrong & Goldstein, 1992; Greiner, 1991)
-    bone: float = 0.07
+    # (Buchholz, Armstrong & Goldstein, 1992; Greiner, 1991), and tips show the hand's length to 4 %
+    bone: float = 0.09
     root_m: float = 6e-3  # of a knuckle's place, and of the thumb's CMC
     # this and thumb_rad: of a finger's and the thumb's rest orientation, about each axis
     root_rad: float = float(np.radians(5.0))
@@ -141,6 +141,7 @@ class Priors:
     # this and thumb_dip_rad: by how much the DIP drifts from that, slowly
     dip_rad: float = float(np.radians(5.0))
     thumb_dip_rad: float = float(np.radians(12.0))
+    straight_dip_rad: float = float(np.radians(2.0))  # the same of a finger that is held straight
     # mean and sd of the PIP of a finger that is held straight
     straight_rad: tuple[float, float] = (float(np.radians(1.5)), float(np.radians(1.5)))
     # this and moving_level_rad: of an angle about what the routine asks for, while held and while it moves
