@@ -31,7 +31,7 @@ from master.calibrate.hand.shape import (
 )
 
 CHANNELS = 26
-_PALM, _ANGLES = 6, 20
+_PALM = 6
 _DIP = 3
 _LOSS = huber(3.0)
 _SLACK_RAD = float(np.radians(10.0))  # hands bend farther than the published limits
@@ -167,10 +167,11 @@ class HandRoutineProblem:
             normal.add(sharpness * off, share * by_shape, share * by, epochs=slice(-1), weights=weights)
 
     def _levers(self, shape: Shape) -> tuple[Float, Float]:
-        """Lengths (26,) that channels turn, as shares of the prior's; (26, size) by the shape.
+        """Lengths (26,) that channels turn, as shares of the prior's; their derivatives.
 
-        The priors of changes are about the way of a tip, not about angles: else a longer bone, that follows the
-        noise by smaller angles, would cost less, and all would come out long (Neyman & Scott, 1948).
+        The derivatives (26, size) are by the shape. Priors of changes are about the way of a tip, not about
+        angles: else a longer bone, which follows the noise by smaller angles, would cost less, and all would
+        come out long (Neyman & Scott, 1948).
         """
         lever, by_shape = np.ones(CHANNELS), np.zeros((CHANNELS, shape.size))
         for f in range(5):
