@@ -100,10 +100,6 @@ class HandRoutineProblem:
         """(T, 5 + B, 3) [m] observed less predicted, NaN where not seen."""
         return self.points_m - self._predicted(state)[0]
 
-    def angles(self, state: State) -> Float:
-        """Joint angles (T, 5, 4) [rad] at the epochs."""
-        return self.knots.at(state.coefficients)[:, _PALM:].reshape(-1, 5, 4)
-
     def shape_sd(self) -> Float:
         """Standard deviations (size,) of the prior shape."""
         return 1.0 / self._shape_prior(self.prior)[0]
@@ -241,11 +237,8 @@ class ShapeFit:
     shape: Shape
     cov: Float  # (size, size) posterior covariance, residuals' spread included
     residual_m: Float  # (T, 5 + B, 3) observed less predicted; NaN: not seen
-    angles_rad: Float  # (T, 5, 4)
     palm: Float  # (K, 6) rotation [rad] and shift [m] of the palm against its first pose
     spread: float  # root of the mean squared whitened residual: 1 where the stated covariances are true
-    alike: float  # factor of the standard deviations because errors last longer than a frame
-    steps: int  # steps taken
 
 
 def fit_shape(
@@ -265,16 +258,14 @@ def fit_shape(
             f"the fit does not settle in {steps} steps: the palm did not rest, or it is not this routine or hand;"
             " record it again, or begin with --length-mm"
         )
-    state = found.x
-    residual = problem.residuals(state)
+    residual = problem.residuals(found.x)
     spread, alike = _spread(problem, residual)
     cov = found.normal.covariance() * (max(spread, 1.0) * alike) ** 2
-    moved = state.coefficients[:, :6]
-    return ShapeFit(state.shape, cov, residual, problem.angles(state), moved, spread, alike, found.steps)
+    return ShapeFit(found.x.shape, cov, residual, found.x.coefficients[:, :_PALM], spread)
 
 
 def _spread(problem: HandRoutineProblem, residual_m: Float) -> tuple[float, float]:
-    """Root mean squared whitened residual, and the factor by its correlation in time.
+    """Root mean squared whitened residual, and the sigmas' factor by its correlation.
 
     Errors that last, such as a cap's hidden part, do not average out: with a correlation r from frame to
     frame, n frames carry as much information as n (1 - r) / (1 + r) independent ones.
