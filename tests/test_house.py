@@ -347,14 +347,18 @@ def numbers(path: str, text: str) -> set[str]:
 
 
 def _settings_in(node: ast.AST, *, whole: bool, inside: bool) -> Iterator[str]:
-    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+    if (
+        isinstance(node, ast.Constant)
+        and isinstance(node.value, int | float)
+        and type(node.value) is not bool
+    ):
         size = abs(node.value)
         plain = size in {0, 0.5, 1, 2} or size <= ROUNDING or size >= HUGE
         in_shape = inside and type(size) is int and size <= JOINTS
         if not (plain or in_shape or (size in FORMULA and not whole)):
             yield f"line {node.lineno}: {node.value}"
-    layout = isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple)
-    layout = layout and all(name.isupper() for name in re.findall(r"\w+", ast.unparse(node.targets[0])))
+    names = ast.unparse(node.targets[0]) if isinstance(node, ast.Assign) else ""
+    layout = "," in names and all(name.isupper() for name in re.findall(r"\w+", names))
     for key, value in ast.iter_fields(node):
         bound = key in {"value", "defaults", "kw_defaults"} and not isinstance(
             node, ast.AugAssign | ast.Return

@@ -376,7 +376,7 @@ def _through(homography: Float, points: Float) -> Float:
     return np.asarray(cv2.perspectiveTransform(points[None], homography), np.float64)[0]
 
 
-def _windows(board: Checkerboard, corners: Float) -> Float:
+def _windows(board: Board, corners: Float) -> Float:
     """Half the side (N,) [px] of each corner's window."""
     rows, columns = grid_shape(board)
     grid = corners.reshape(rows, columns, 2)

@@ -190,7 +190,7 @@ def lateness(observations: Sequence[Observation], bundle: Bundle) -> Bundle:
 def _add_late(normal: Normal, late_s: Float, weight: float) -> None:
     """Add the prior of late frames: `weight` [1/s] is 1 over its deviation."""
     normal.cost += weight**2 * float((late_s**2).sum())
-    np.einsum("vii->vi", normal.own)[:, 6:] += weight**2
+    np.einsum("vii->vi", normal.own[0])[:, 6:] += weight**2
     normal.own_gradient[:, 6:] += weight**2 * late_s
 
 

@@ -245,13 +245,15 @@ def fit_tracks(
     while True:
         views, final = tracks.views(delay_s), late_sd_s > 0.0
         fit = fit_cameras(views, held, bent=bent if final else False, near=near, late_sd_s=late_sd_s)
-        steps = fit.solution.bundle.delay_s.tolist()
+        steps = fit.solution.bundle.delay_s
         near = dict(zip(views.cameras, fit.solution.bundle.lenses, strict=True))
-        delay_s = {name: delay_s[name] + step for name, step in zip(tracks.cameras, steps, strict=True)}
+        delay_s = {
+            name: delay_s[name] + step for name, step in zip(tracks.cameras, steps.tolist(), strict=True)
+        }
         if final:
             return replace(fit, delay_s=delay_s)
         rounds -= 1
-        if not rounds or max(map(abs, steps)) < settled_s:
+        if not rounds or float(np.abs(steps).max()) < settled_s:
             late_sd_s = 0.01  # a program that asks a camera of 30 Hz gets a frame that is up to 33 ms old
 
 

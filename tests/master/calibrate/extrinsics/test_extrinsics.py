@@ -120,14 +120,15 @@ def test_what_was_not_seen_together_is_refused() -> None:
         calibrated(seen, markers=others)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda uv, _: np.stack([639.0 - uv[:, 0], uv[:, 1]], axis=1),
-        lambda uv, late: uv + np.array([0.0, 20.0 * late]),
-    ],
-    ids=["mirrored", "the device slipped"],
-)
+def mirrored(uv: Float, _late: bool) -> Float:
+    return np.stack([639.0 - uv[:, 0], uv[:, 1]], axis=1)
+
+
+def slipped(uv: Float, late: bool) -> Float:
+    return uv + np.array([0.0, 20.0 * late])
+
+
+@pytest.mark.parametrize("change", [mirrored, slipped])
 def test_pictures_that_no_mounting_explains_are_refused(change: Callable[[Float, bool], Float]) -> None:
     seen = moved()
     wrong = [

@@ -82,18 +82,30 @@ def test_a_bead_that_is_bent_aside_half_way_is_named(motion: Observations, bead:
         measure_object(replace(motion, value=points))
 
 
+def camera_moved(uv: Float, share: float) -> Float:
+    return uv + np.array([4.0 * (share > 0.5), 0.0])
+
+
+def mirrored(uv: Float, _share: float) -> Float:
+    return np.stack([639.0 - uv[:, 0], uv[:, 1]], axis=1)
+
+
+def few(uv: Float, share: float) -> Float:
+    return uv + (0.0 if share < 0.15 else np.nan)
+
+
+def never(uv: Float, _share: float) -> Float:
+    return np.full_like(uv, np.nan)
+
+
 @pytest.mark.parametrize(
     ("change", "cause"),
     [
-        (lambda uv, share: uv + np.array([4.0 * (share > 0.5), 0.0]), "not rigid.* a camera moved meanwhile"),
-        (
-            lambda uv, _: np.stack([639.0 - uv[:, 0], uv[:, 1]], axis=1),
-            "all beads are seen by two cameras at",
-        ),
-        (lambda uv, share: uv + (0.0 if share < 0.15 else np.nan), r"three beads|all beads .* at least 60"),
-        (lambda uv, _: uv + np.nan, "no bead is seen by two cameras at once"),
+        (camera_moved, "not rigid.* a camera moved meanwhile"),
+        (mirrored, "all beads are seen by two cameras at"),
+        (few, r"three beads|all beads .* at least 60"),
+        (never, "no bead is seen by two cameras at once"),
     ],
-    ids=["camera moved", "mirrored", "few", "NaN"],
 )
 def test_a_fault_of_one_camera_is_refused_by_name(
     change: Callable[[Float, float], Float], cause: str

@@ -81,16 +81,32 @@ def curled() -> Float:
     return uv + np.random.default_rng(0).normal(0.0, 0.3, uv.shape)
 
 
+def slipped(uv: Float) -> Float:
+    later = np.arange(len(uv)) >= len(uv) // 2
+    return uv + 20.0 * later[:, None, None] * np.array([1.0, 0.0])
+
+
+def few(uv: Float) -> Float:
+    return uv[:15]
+
+
+def never(uv: Float) -> Float:
+    return np.full_like(uv, np.nan)
+
+
+def at_rest(uv: Float) -> Float:
+    return uv[:1] + 0.0 * uv
+
+
 @pytest.mark.parametrize(
     ("spoil", "cause"),
     [
-        (lambda uv: uv + np.where(np.arange(120) < 60, 0.0, 20.0)[:, None, None] * [1.0, 0.0], "the device slipped on"),
-        (lambda uv: uv[:15], "15 points, at least 20"),
-        (lambda uv: np.full_like(uv, np.nan), "0 points, at least 20"),
-        (lambda uv: uv[:1] + 0.0 * uv, "moved by 0.0 mm, at least 15 are needed: bend it to a fist"),
+        (slipped, "the device slipped on"),
+        (few, "15 points, at least 20"),
+        (never, "0 points, at least 20"),
+        (at_rest, "moved by 0.0 mm, at least 15 are needed: bend it to a fist"),
     ],
-    ids=["slipped", "few", "NaN", "at rest"],
-)  # fmt: skip
+)
 def test_a_curl_that_gives_no_lines_is_refused(spoil: Callable[[Float], Float], cause: str) -> None:
     normal, offset_m = laser_plane_of(RIG, "the rig")
 

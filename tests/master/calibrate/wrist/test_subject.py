@@ -173,14 +173,25 @@ def test_a_motion_without_its_parts_is_refused(seen: Float, match: str) -> None:
         guided(seen)
 
 
+def mirrored(uv: Float, _name: str) -> Float:
+    return np.stack([639.0 - uv[:, 0], uv[:, 1]], axis=1)
+
+
+def no_tips(uv: Float, name: str) -> Float:
+    return uv + (np.nan if name == "tip" else 0.0)
+
+
+def no_laser(uv: Float, name: str) -> Float:
+    return uv + (np.nan if name == "laser" else 0.0)
+
+
 @pytest.mark.parametrize(
     ("change", "cause"),
     [
-        (lambda uv, _: np.stack([639.0 - uv[:, 0], uv[:, 1]], axis=1), "no likely subject.*hand and side"),
-        (lambda uv, name: uv + (np.nan if name == "tip" else 0.0), "0 fingertips are seen, at least 8"),
-        (lambda uv, name: uv + (np.nan if name == "laser" else 0.0), "0 fingers bend before the laser"),
+        (mirrored, "no likely subject.*hand and side"),
+        (no_tips, "0 fingertips are seen, at least 8"),
+        (no_laser, "0 fingers bend before the laser"),
     ],
-    ids=["mirrored", "no tips", "no laser"],
 )
 def test_a_fault_of_the_device_is_refused_by_name(
     people: dict[int, Person],
