@@ -92,6 +92,11 @@ def calibrate_subject(
     chosen = guided(points[..., 1])
     tips = np.array([one.tip_uv for one in cycles])[chosen.row, 1:]
     tip_sigma_px = np.array([one.tip_sigma_px for one in cycles])[chosen.row, 1:]
+    tips_seen, fewest = int(np.isfinite(tips[..., 0]).sum()), 8
+    if tips_seen < fewest:
+        raise FitError(
+            f"{tips_seen} fingertips are seen, at least {fewest} are needed: {MOTION}, in sight of the camera"
+        )
     seen = ImageObservations(points[chosen.row], tips, tip_sigma_px, chosen.bend)
     sigma = prior_sigma(_pose_sigma(rig), _length_sigma(hand))
     fit = fit_subject(model, seen, sigma)
@@ -126,11 +131,6 @@ def _length_sigma(hand: HandProfile) -> Float:
 
 def _check(fit: Fit, seen: ImageObservations) -> None:
     """Refuse what does not reach the minimum, and what is not likely."""
-    tips, fewest = int(np.isfinite(seen.tip_uv[..., 0]).sum()), 8
-    if tips < fewest:
-        raise FitError(
-            f"{tips} fingertips are seen, at least {fewest} are needed: {MOTION}, in sight of the camera"
-        )
     knuckles = (seen.bend != FLAT) & ~fit.fist
     if not knuckles.any() or not fit.fist.any():
         missing = "closes to a fist" if knuckles.any() else "bends straight fingers at their knuckles"

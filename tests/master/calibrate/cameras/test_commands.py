@@ -1,6 +1,7 @@
 """The commands on real pictures: the numbers asked for, the files they write, and what they say to bad input."""
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ from common.calibration import CameraCalibration, PowerLawCalibration, RigCalibr
 from common.errors import CalibrationError, PhalanxError, RecordingError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import invert
+from common.recording.frame_recording import FRAMES, MANIFEST
 from master.calibrate.cameras.boards import Checkerboard, find_board, grid_edges
 from master.calibrate.cameras.commands import without_wrong_law, write_files
 from master.calibrate.cameras.views import image_sets
@@ -125,6 +127,26 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for view in range(8):
             cv2.imwrite(str(folder / camera / f"{view:02d}.png"), render(truth, view, camera, seed=31))
     return folder
+
+
+def test_a_recording_of_cameras_that_are_not_synchronised_is_calibrated(
+    views: Path, tmp_path: Path, datasets: Path
+) -> None:
+    manifest = sorted((datasets / "stereo").glob(f"*/{MANIFEST}"))[0]
+    (tmp_path / MANIFEST).write_bytes(manifest.read_bytes())
+    rows, held, step_ns = ["camera,seq,t_ns,illumination,file"], 12, 33_333_333
+    for camera, late_ns in (("left", 0), ("right", 13_000_000)):
+        for view in range(8):
+            shutil.copy(views / camera / f"{view:02d}.png", tmp_path / f"{camera}{view}.png")
+            for k in range(held * view, held * (view + 1)):
+                t_ns = k * step_ns + view * 500_000_000 + late_ns
+                rows.append(f"{camera},{k},{t_ns},none,{camera}{view}.png")
+    (tmp_path / FRAMES).write_text("\n".join(rows) + "\n")
+    words = ("stereo", tmp_path, *BOARD, "--json", tmp_path / "result.json")
+    assert "left: 48 of 48 frames, the board in 48" in run(*words, "--calibration", tmp_path / "none")
+    pair = json.loads((tmp_path / "result.json").read_text())["pairs"][0]
+    assert pair["views"] == 8
+    assert pair["edge_mean_mm"] == pytest.approx(25.0, abs=0.05)
 
 
 def test_a_rig_that_is_there_keeps_everything_but_the_places_and_a_law_that_they_contradict(

@@ -1,4 +1,4 @@
-"""Coverage says what is missing; a recording of frames is a source of views."""
+"""Coverage says what is missing; a recording of frames is a source of streams."""
 
 from pathlib import Path
 
@@ -50,7 +50,7 @@ def test_advice_needs_no_lens() -> None:
     assert advice_so_far(views, "nobody") == "show the board to nobody"
 
 
-def test_frames_of_a_recording_nearest_in_time_make_a_view(tmp_path: Path, datasets: Path) -> None:
+def test_frames_of_a_recording_are_streams_by_their_stamps(tmp_path: Path, datasets: Path) -> None:
     sources = sorted(path.parent for path in (datasets / "stereo").glob(f"*/{MANIFEST}"))
     assert sources
     source = sources[0]

@@ -128,7 +128,7 @@ def test_intrinsics_of_the_wrist_camera_from_the_same_recording(
     assert lens.provenance["intrinsics"].residual["rms_px"] < 0.2
     assert "rms" in output
     # One frame of each triple, not all three: nothing with the laser's line across the corners.
-    assert "of 7 images" in output or "wrist: 7 images" in output
+    assert "wrist: 7 of 7 frames" in output
 
 
 def test_the_flat_field_names_the_corner_that_was_not_shown(tree: Path, boards: Path) -> None:
