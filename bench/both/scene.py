@@ -351,15 +351,6 @@ class Solved:
         safe = np.where(known[..., None, None], cov, np.eye(3))
         return np.where(known, chi_squares(off, safe), np.nan)
 
-    @property
-    def steps_mm(self) -> Float:
-        """(N - 1, 25) step from pose to pose beyond the truth's own [mm]; NaN where it is no step."""
-        step = np.diff(self.poses.position_m, axis=0) - np.diff(self.truth_m, axis=0)
-        valid = self.poses.valid[1:] & self.poses.valid[:-1]
-        follows_s = 0.1  # poses farther apart are a new beginning, not a step
-        valid &= (np.diff(self.t_s) <= follows_s)[:, None]
-        return np.where(valid, 1e3 * np.linalg.norm(step, axis=2), np.nan)[:, 1:]
-
 
 def _placed(found: Poses, wrist_m: Float, wrist_rotation: Float) -> Poses:
     """A hand with the wrist joint there (N, 3) and turned so (N, 3, 3)."""

@@ -11,7 +11,6 @@ from functools import partial
 import numpy as np
 
 from bench.hands import draws
-from bench.hands.chains import Fabrik
 from bench.hands.draws import MARKERS, Angles, Draw, Fingers, Score
 from bench.report import Row, rms
 from common.hand.model import HandModel
@@ -19,8 +18,7 @@ from master.fabrik.linear_algebra import Vector
 from master.fabrik.solver import Finger
 
 CLOSED, WARM_STARTED, PAPER = "closed form", "FABRIK, seeded", "papers' way"
-_FROM_REST = "FABRIK, from rest"
-_SLOW = {PAPER: 10, _FROM_REST: 10, "scipy": 40}  # one hand in so many
+_SLOW = {PAPER: 10, "scipy": 40}  # one hand in so many
 _STRICT_MM = {CLOSED: 1e-3, WARM_STARTED: 0.1}  # by how much these two may miss
 
 
@@ -47,7 +45,6 @@ def ways(model: HandModel) -> dict[str, Fingers]:
     return {
         CLOSED: partial(draws.closed_form, fingers),
         WARM_STARTED: _seeded(model),
-        _FROM_REST: _from_rest(fingers),
         PAPER: draws.PaperFingers(fingers).push,
         "scipy": lambda tips: [draws.scipy_finger(one, tip) for one, tip in zip(fingers, tips, strict=True)],
     }
@@ -61,16 +58,6 @@ def _seeded(model: HandModel) -> Fingers:
         for finger, tip, row in zip(fingers, tips, angles, strict=True):
             finger.solve(np.array(tip), row)
         return angles.tolist()
-
-    return way
-
-
-def _from_rest(fingers: Sequence[Finger]) -> Fingers:
-    prepared = [Fabrik.of(solver.chain, restarts=0) for solver in fingers]
-
-    def way(tips: Sequence[Vector]) -> Angles:
-        found = [f.solve(tip, None, one.root) for f, one, tip in zip(prepared, fingers, tips, strict=True)]
-        return [one.angles.tolist() for one in found]
 
     return way
 

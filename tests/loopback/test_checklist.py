@@ -10,11 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from bench.rigs.local import Lag, until
+from bench.rigs.local import until
 from common.messages.streams import MASTER
 from tests.loopback.checklist_faults import (
     BEHIND,
     BEHIND_S,
+    Lag,
     clean,
     of_markers,
     rehearsed,
