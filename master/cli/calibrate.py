@@ -50,7 +50,7 @@ def add_dictionary(command: ArgumentParser) -> None:
 
 def add_board_pictures(command: ArgumentParser) -> None:
     """The pictures of a board, the board, and which cameras."""
-    add_path(command, "source", "SOURCE", "folder: CAMERA*.png|jpg, or a folder per camera, or a recording")
+    add_path(command, "source", "SOURCE", "folder of CAMERA*.png, CAMERA.mp4 or CAMERA/, or a recording")
     add_board(command)
     add_names(command, "--camera", "NAME", "a camera; once for each (default: all that have images)")
 
@@ -145,15 +145,14 @@ def intrinsics(command: ArgumentParser) -> None:
 
 
 def stereo(command: ArgumentParser) -> None:
-    """Measure where all cameras of a rig stand, and their lenses, in one bundle.
-
-    Two cameras or more.
+    """Measure where two or more cameras stand, and their lenses, in one bundle.
 
     Not every camera needs to see every view, as long as shared views link them all. The rig's frame stays that of its
     file. Nothing is written without --out.
 
     Examples:
       phalanx calibrate cameras stereo views --board 9x6 --square-mm 25 --rig desk --out calib_json
+      phalanx calibrate cameras stereo videos --board 9x6 --square-mm 29 --marker-mm 21.75 --picture views.png
       phalanx calibrate cameras stereo views --camera left --camera right --board 9x6 --square-mm 25 --keep-intrinsics
     """
     add_board_pictures(command)
