@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.rigs.local import UP_S, Lag, Rig, RigError, until
+from bench.rigs.local import UP_S, Rig, RigError, until
 from bench.rigs.rooms import DESK, slower, standard_scene
 from bench.rigs.sender import WAY_S, scene_s
 from common.arrays import Float
@@ -28,6 +28,7 @@ from common.errors import BusError
 from common.messages import WIRE_VERSION, Checklist, HandPose
 from common.messages.streams import MASTER
 from tests.faults.relay import Impairment, UdpRelay
+from tests.lag import Lag
 
 _GRID_HZ = 200.0
 _GAP_S = 0.2

@@ -2,7 +2,6 @@
 
 import signal
 import statistics
-import threading
 import time
 import warnings
 from collections.abc import Callable, Sequence, Set
@@ -12,6 +11,7 @@ from typing import Any
 from bench.rigs.local import until
 from common.messages import CheckCode
 from tests.faults.relay import Impairment
+from tests.lag import Lag
 from tests.slaves_rig import Key, SlavesRig, measured, read, write
 
 WAIT_S, AFTER_S = 30.0, 2.5  # for a line of the list; for what follows from a fault
@@ -20,33 +20,6 @@ BEHIND_S = 0.05  # so late a sleep is where a machine has other things to do
 # A machine that is behind draws fewer pictures than it should: then that is listed as well, and it is true.
 BEHIND = {"rate_low"}
 _COLOUR_OF_BACK = (64, 178, 130)  # sRGB, blue first: the reference colour of the marker
-
-
-class Lag:
-    """The worst delay of a sleep of this process: how far the machine is behind. Holds a thread."""
-
-    STEP_S = 0.02
-
-    def __init__(self) -> None:
-        """Measure from now on."""
-        self.late_s: list[float] = []
-        self._stop = threading.Event()
-        threading.Thread(target=self._measure, daemon=True).start()
-
-    @property
-    def worst_s(self) -> float:
-        """Of all sleeps so far."""
-        return max(self.late_s, default=0.0)
-
-    def close(self) -> None:
-        """Measure no more."""
-        self._stop.set()
-
-    def _measure(self) -> None:
-        while not self._stop.is_set():
-            began = time.monotonic()
-            time.sleep(self.STEP_S)
-            self.late_s.append(time.monotonic() - began - self.STEP_S)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,10 +12,10 @@ import pytest
 
 from bench.rigs.local import until
 from common.messages.streams import MASTER
+from tests.lag import Lag
 from tests.loopback.checklist_faults import (
     BEHIND,
     BEHIND_S,
-    Lag,
     clean,
     of_markers,
     rehearsed,

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from bench.rigs.local import Lag
+from tests.lag import Lag
 from tests.loopback.checklist_faults import Fault, of_markers, of_wrist, rehearsed
 from tests.slaves_rig import SlavesRig
 
