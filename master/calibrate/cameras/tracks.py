@@ -173,21 +173,19 @@ def _step_s(t_s: Float) -> float:
 
 
 def _wanted(t_s: Mapping[str, Float]) -> dict[str, Int]:
-    """Indices of at most 600 frames of each camera, 15 a second.
+    """Indices of the frames to look at: about 15 a second of each camera.
 
-    Of more frames they are in bursts of a second. Bursts are at the same times for all cameras.
+    Of more than 600 frames they are in 40 bursts of a second, at the same times for all cameras.
     """
-    fastest_hz, most = 15.0, 600
+    usual_hz, most = 15.0, 600
     thinned = {
-        name: np.arange(
-            0, len(t), max(int(1.0 / fastest_hz / max(_step_s(t), 1e-6) + 0.01), 1), dtype=np.int64
-        )
+        name: np.arange(0, len(t), max(round(1.0 / (usual_hz * max(_step_s(t), 1e-6))), 1), dtype=np.int64)
         for name, t in t_s.items()
     }
     if max(map(len, thinned.values())) <= most:
         return thinned
     first, last = max(float(t[0]) for t in t_s.values()), min(float(t[-1]) for t in t_s.values())
-    begins = np.linspace(first, max(last - 1.0, first), round(most / fastest_hz))
+    begins = np.linspace(first, max(last - 1.0, first), round(most / usual_hz))
     found: dict[str, Int] = {}
     for name, frames in thinned.items():
         since = np.searchsorted(begins, t_s[name][frames], side="right") - 1

@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from common.arrays import Float
+from common.arrays import Float, Image
 from common.errors import FitError, PhalanxError, RecordingError
 from common.geometry.transforms import invert, rigid, rotation_vector_to_matrix
 from master.calibrate.cameras.boards import Charuco, ImageObservation, board_corners
 from master.calibrate.cameras.coverage import LiveViews
 from master.calibrate.cameras.fit import fit_tracks
-from master.calibrate.cameras.tracks import Track, Tracks
+from master.calibrate.cameras.tracks import Stream, Track, Tracks, track
 from tests.cli import calibrate
 from tests.master.calibrate.cameras.board_images import render
 from tests.master.calibrate.cameras.board_scenes import SIZE, Scene, scene
@@ -192,3 +192,27 @@ def test_real_webcams_find_the_squares(datasets: Path) -> None:
     mean, _, sd = line.split(": ")[1].split()[:3]
     assert float(mean) == pytest.approx(54.0, abs=0.3)
     assert float(sd) < 0.5
+
+
+def test_of_ten_minutes_a_few_hundred_frames_are_looked_at_the_same_moments_of_all_cameras() -> None:
+    read: dict[str, list[int]] = {"left": [], "right": []}
+    empty = np.full((60, 80), 128, np.uint8)
+
+    def stream(camera: str, rate_hz: float, start_s: float) -> Stream:
+        def reader(number: int) -> Image:
+            read[camera].append(number)
+            return empty
+
+        t_s = start_s + np.arange(int(600 * rate_hz)) / rate_hz
+        return Stream(tuple(range(len(t_s))), t_s, reader, camera)
+
+    streams = {"left": stream("left", 30.0, 0.0), "right": stream("right", 24.0, 3.0)}
+    with pytest.raises(FitError, match=r"in any of \d+ frames"):
+        track(BOARD, streams, lambda _: None)
+    looked = {name: streams[name].t_s[numbers] for name, numbers in read.items()}
+    for name, t_s in looked.items():
+        assert 400 < len(t_s) <= 640, name
+        assert (np.diff(t_s) > 0.0).all(), "files are read from front to back"
+    nearest_s = np.abs(looked["left"][:, None] - looked["right"]).min(axis=1)
+    assert float(np.quantile(nearest_s, 0.99)) < 0.1
+    assert looked["left"][-1] - looked["left"][0] > 500.0
