@@ -187,7 +187,7 @@ def fit_cameras(
     Args:
         held: Camera -> known lens (9,), in the order of `bundle.LENS`; those of the others are estimated.
         bent: Estimate the board's shape too; False: it is exactly as drawn (a print on glass, a screen);
-            None: the one that predicts held-out views better, flat where that is not certain.
+            None: the one that predicts held-out views better, flat where that is not certain or it was moving.
         near: Camera -> lens (9,) of an earlier fit, to begin with.
         late_sd_s: Standard deviation of single frames' times [s], to begin with; 0: they are exact.
 
@@ -198,8 +198,9 @@ def fit_cameras(
     near = near or {}
     alone = {camera: fit_alone(views, camera, held.get(camera), near.get(camera)) for camera in views.cameras}
     links = link(views.board, views.cameras, {camera: fit.T_camera_board for camera, fit in alone.items()})
-    moving = any(seen.speed_px_s is not None for view in views.views for seen in view.observations.values())
-    if late_sd_s > 0.0 or not moving:  # until its lag is known, a waved board is off as if cameras moved
+    known = (seen.speed_px_s for view in views.views for seen in view.observations.values())
+    speeds = [np.nanmedian(np.linalg.norm(speed, axis=1)) for speed in known if speed is not None]
+    if late_sd_s > 0.0 or not speeds:  # until its lag is known, a waved board is off as if cameras moved
         _refuse_moved(views, alone, links)
     seen = Seen(views, links.corner_order)
     drawn = board_corners(views.board)
@@ -215,6 +216,9 @@ def fit_cameras(
     )
     if bent is not None:
         return _fit(seen, alone, start, held, BoardChoice(bent, reason="as asked for"))
+    if speeds and float(np.median(speeds)) > 10.0:  # px/s
+        reason = "it was moving, and cameras that expose row by row bend its image (--bent-board estimates its shape)"
+        return _fit(seen, alone, start, held, BoardChoice(bent=False, reason=reason))
     flat = _fit(seen, alone, start, held, BoardChoice(bent=False))
     count = len({shot.place for shot in flat.shots})
     if count < MIN_SHAPE_VIEWS:
@@ -245,15 +249,14 @@ def fit_tracks(
     while True:
         views, final = tracks.views(delay_s), late_sd_s > 0.0
         fit = fit_cameras(views, held, bent=bent if final else False, near=near, late_sd_s=late_sd_s)
-        steps = fit.solution.bundle.delay_s
-        near = dict(zip(views.cameras, fit.solution.bundle.lenses, strict=True))
-        delay_s = {
-            name: delay_s[name] + step for name, step in zip(tracks.cameras, steps.tolist(), strict=True)
-        }
+        bundle = fit.solution.bundle
+        near = dict(zip(views.cameras, bundle.lenses, strict=True))
+        steps = dict(zip(views.cameras, bundle.delay_s.tolist(), strict=True))
+        delay_s = {name: delay_s[name] + step for name, step in steps.items()}
         if final:
             return replace(fit, delay_s=delay_s)
         rounds -= 1
-        if not rounds or float(np.abs(steps).max()) < settled_s:
+        if not rounds or float(np.abs(bundle.delay_s).max()) < settled_s:
             late_sd_s = 0.01  # a program that asks a camera of 30 Hz gets a frame that is up to 33 ms old
 
 
