@@ -7,9 +7,15 @@ import cv2
 import msgspec
 import numpy as np
 
+from common.arrays import Float
 from common.messages import Preview, Still
 
 TINY = cv2.imencode(".jpg", np.full((16, 16, 3), 90, np.uint8))[1].tobytes()  # about 630 bytes
+
+
+def mirrored(uv: Float, *_: object) -> Float:
+    """Pixels (n, 2) as a camera of 640 px sees them that shows its pictures mirrored."""
+    return np.stack([639.0 - uv[:, 0], uv[:, 1]], axis=1)
 
 
 def claiming(width: int, height: int, jpeg: bytes = TINY) -> bytes:

@@ -99,7 +99,7 @@ class CapSettings(NamedTuple):
     any_m: float = 4e-3  # of a cap's seen centroid while nothing measures where the finger points
     any_rad: float = 1.0  # of the direction of a finger that shows its end, from that to the cameras
     most_tilt: float = 2.0  # largest tangent of the tilt of a sigma point, which stays on its side
-    bent_rad: float = 2.356194490192345  # from the camera, of an unknown hand: it still shows a strip
+    bent_rad: float = 0.75 * pi  # from the camera, of an unknown hand: it still shows a strip
     tilted: int = 7  # directions of a cap of a known hand
     any_tilted: int = 5  # and while no hand is known
     angles: int = 90  # steps of the tables
@@ -128,13 +128,10 @@ class DepthSettings(NamedTuple):
 class FilterSettings(NamedTuple):
     """Numbers of the 1 € filter beside those of the rig file."""
 
-    new_share: float = (
-        0.25  # of a marker's noise variance in each frame: on rendered hands 0.1; light, shape stay
-    )
+    new_share: float = 0.25  # of a marker's noise variance in each frame: rendered 0.1; light, shape stay
     quantile: float = 9.0  # chi-square, one degree of freedom, 99.7 %: what is beyond is motion
-    shown: float = (
-        0.25  # of a solved pose's noise: as a prior of the next it stays, of seven tenths a quarter shows
-    )
+    # Of a solved pose's noise: as a prior of the next it stays, of seven tenths a quarter shows.
+    shown: float = 0.25
     memory_s: float = 0.4  # a few swings of a trembling hand
 
 
@@ -154,9 +151,7 @@ class FabrikSettings(NamedTuple):
     damping_up: float = 10.0  # by which it grows
     damping_down: float = 0.1
     reached_m: float = 1e-6
-    within: float = (
-        0.05  # of that, where a limit passed by less is rounding: clamping moves the point < 0.2 um
-    )
+    within: float = 0.05  # of that, where a limit passed by less is rounding: clamping moves it < 0.2 um
     branch: float = 2.0 * pi  # rad by which the more bent branch is rather taken: more than any abduction
     # PIP and DIP, as shares of their ranges, from which a free pair is sought when the coupled one fails.
     starts: tuple[tuple[float, float], ...] = (

@@ -243,10 +243,7 @@ def find_board(board: Board, image: Image) -> ImageObservation | None:
         corners = _circles(board, grey)
     else:
         corners = _charuco(board, grey) if isinstance(board, Charuco) else _checkerboard(board, grey)
-        corners = None if corners is None else _refine(board, grey, corners)
-    if corners is None:
-        return None
-    if np.isfinite(corners[:, 0]).sum() < 8:  # a pose and a few corners to check it
+    if corners is None or np.isfinite(corners[:, 0]).sum() < 8:  # a pose and a few corners to check it
         return None
     return ImageObservation(corners, _blur(board, grey, corners))
 
@@ -261,7 +258,8 @@ def _checkerboard(board: Checkerboard, grey: Image) -> Float | None:
         found, corners = cv2.findChessboardCorners(grey, size, flags=classic)
     if not found:
         return None
-    return _upright(board, grey, np.asarray(corners, dtype=np.float64).reshape(-1, 2))
+    rough = _upright(board, grey, np.asarray(corners, dtype=np.float64).reshape(-1, 2))
+    return _refined(board, grey, rough)
 
 
 def _circles(board: CircleGrid, grey: Image) -> Float | None:
@@ -316,21 +314,18 @@ def _charuco(board: Charuco, grey: Image) -> Float | None:
     rows, columns = grid_shape(board)
     corners = np.full((rows * columns, 2), np.nan)
     corners[ids.reshape(-1)] = found.reshape(-1, 2)
-    return corners
+    return _refined_upright(board, grey, corners)
 
 
-def _refine(board: Board, grey: Image, corners: Float) -> Float:
-    """Refine rough corners; NaN: one that moves by more than its window."""
-    if isinstance(board, Charuco):
-        return _refined_upright(board, grey, corners)
+def _refined(board: Checkerboard, grey: Image, corners: Float) -> Float | None:
+    """Refine rough corners; None: one moves by more than its window.
+
+    A checkerboard is found whole or not at all: one wrong corner condemns the grid.
+    """
     half = _windows(board, corners)
-    refined = np.full_like(corners, np.nan)
-    for i in np.flatnonzero(np.isfinite(half)):
-        place = _sub_pixel(grey, corners[i : i + 1], int(half[i]))
-        if np.abs(place - corners[i]).max() <= half[i]:
-            refined[i] = place
-    # Found whole or not at all: one wrong corner condemns the grid.
-    return np.full_like(corners, np.nan) if np.isnan(refined).any() else refined
+    each = zip(corners[:, None], half.astype(int).tolist(), strict=True)
+    refined = np.concatenate([_sub_pixel(grey, corner, window) for corner, window in each])
+    return None if (np.abs(refined - corners) > half[:, None]).any() else refined
 
 
 def _refined_upright(board: Charuco, grey: Image, corners: Float) -> Float:
@@ -376,7 +371,7 @@ def _through(homography: Float, points: Float) -> Float:
     return np.asarray(cv2.perspectiveTransform(points[None], homography), np.float64)[0]
 
 
-def _windows(board: Board, corners: Float) -> Float:
+def _windows(board: Checkerboard, corners: Float) -> Float:
     """Half the side (N,) [px] of each corner's window."""
     rows, columns = grid_shape(board)
     grid = corners.reshape(rows, columns, 2)

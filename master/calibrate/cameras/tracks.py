@@ -144,9 +144,9 @@ def track(board: Board, streams: Mapping[str, Stream], progress: Callable[[str],
     finder, tracks, sizes = Finder(board), dict[str, Track](), dict[str, tuple[int, int]]()
     every = _wanted({name: stream.t_s for name, stream in streams.items()})
     for name, stream in streams.items():
-        wanted = every[name]
+        wanted: list[int] = every[name].tolist()
         found, broken = list[ImageObservation | None](), ""
-        for done, i in enumerate((int(i) for i in wanted), 1):
+        for done, i in enumerate(wanted, 1):
             try:
                 image = stream.read(stream.numbers[i])
                 check_alike(sizes, name, str(stream.numbers[i]), image)
@@ -159,7 +159,7 @@ def track(board: Board, streams: Mapping[str, Stream], progress: Callable[[str],
                 progress(f"{name}: {done} of {len(wanted)} frames, the board in {seen}")
         if name not in sizes:
             raise FitError(f"{stream.source}: {broken}")
-        tracks[name] = Track(tuple(stream.numbers[int(i)] for i in wanted), stream.t_s[wanted], tuple(found))
+        tracks[name] = Track(tuple(stream.numbers[i] for i in wanted), stream.t_s[wanted], tuple(found))
     if not any(one for own in tracks.values() for one in own.found):
         raise FitError(
             f"no {board} in any of {sum(len(t.found) for t in tracks.values())} frames: {finder.advice()}"

@@ -292,11 +292,9 @@ def _expected(pair: Pair, distance: Float, angle: Float, noise: Noise) -> tuple[
             "no budget: focal length and baseline are not known (--rig NAME; --fov-deg without intrinsics)"
         ], {}
     errors = {name: off_axis(law, pair.models, distance, angle) for name, law in laws_of(pair.rig).items()}
-    baseline_m, ideal = (
-        float(np.linalg.norm(pair.models[1].centre - pair.models[0].centre)),
-        ideal_of(*pair.models),
-    )
+    baseline_m = float(np.linalg.norm(pair.models[1].centre - pair.models[0].centre))
     assumed = {"sigma_px": noise.sigma_px, "speed_m_s": noise.speed_m_s, "skew_s": noise.skew_s}
+    ideal = ideal_of(*pair.models)
     expected = [error_budget(ideal, d, baseline_m, **assumed) for d in distance.tolist()]
     wanted = 0.02  # of the depth, as the published rig
     apart_ms = 1e3 * tolerable_skew_s(wanted, baseline_m, 1.0)

@@ -22,6 +22,7 @@ from tests.cli import calibrate
 from tests.master.calibrate.extrinsics.moved import CAMERA_LATE_NS, IMU_LATE_NS, Moved, moved
 from tests.master.calibrate.extrinsics.worn import errors
 from tests.master.replay.test_solve_both import write_detections
+from tests.picture_helpers import mirrored
 
 CERTAIN = {
     "rotation_sigma_deg": 1.0,
@@ -118,10 +119,6 @@ def test_what_was_not_seen_together_is_refused() -> None:
     others = tuple("back" if name == "index" else name for name in seen.both.markers.markers)
     with pytest.raises(FitError, match="no marker sits on the tip of the index finger"):
         calibrated(seen, markers=others)
-
-
-def mirrored(uv: Float, _late: bool) -> Float:
-    return np.stack([639.0 - uv[:, 0], uv[:, 1]], axis=1)
 
 
 def slipped(uv: Float, late: bool) -> Float:

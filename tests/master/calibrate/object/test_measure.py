@@ -21,6 +21,7 @@ from master.calibrate.object.beads import (
 )
 from master.calibrate.observations import Observations, points_of_detections, points_of_poses, rows_of
 from tests.master.calibrate.object.motions import BEADS, MODELS, PLACES_M, RATES, RIG, body, messages, seen
+from tests.picture_helpers import mirrored
 
 
 def off_mm(found: Measurement) -> Float:
@@ -84,10 +85,6 @@ def test_a_bead_that_is_bent_aside_half_way_is_named(motion: Observations, bead:
 
 def camera_moved(uv: Float, share: float) -> Float:
     return uv + np.array([4.0 * (share > 0.5), 0.0])
-
-
-def mirrored(uv: Float, _share: float) -> Float:
-    return np.stack([639.0 - uv[:, 0], uv[:, 1]], axis=1)
 
 
 def few(uv: Float, share: float) -> Float:

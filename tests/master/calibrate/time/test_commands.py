@@ -15,6 +15,7 @@ from master.calibrate.time_offsets import measure_times, shifted
 from tests import timing_scenes as scenes
 from tests.cli import invoke
 from tests.hand_helpers import camera_file, rig_file
+from tests.picture_helpers import mirrored
 from tests.timing_scenes import Motion, cameras, recorded
 
 RATES = {"left": 60.0, "right": 60.0}
@@ -120,8 +121,7 @@ def of_right(change: Callable[[MarkerDetections, bool], MarkerDetections]) -> li
         ),
         (
             lambda: [
-                msgspec.structs.replace(one, uv=np.stack([639.0 - one.uv[:, 0], one.uv[:, 1]], axis=1))
-                for one in of_right(lambda one, _: one)
+                msgspec.structs.replace(one, uv=mirrored(one.uv)) for one in of_right(lambda one, _: one)
             ],
             "no ray of 'right' meets those of 'left': are pictures mirrored, cameras exchanged",
         ),

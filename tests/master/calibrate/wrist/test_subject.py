@@ -27,6 +27,7 @@ from master.calibrate.wrist.subject_fit import FLAT, fists_of, guided
 from master.calibrate.wrist.subject_model import MCP, UNKNOWN, SubjectModel, Unknown, fitted_profile
 from master.rig.setup import WristSetup
 from tests.cli import calibrate
+from tests.picture_helpers import mirrored
 
 ANGLES = np.radians(
     [[[2.0, 0.0, 0.0]] * 4, [[0.0, 50.0, 4.0]] * 4, [[-3.0, 85.0, 0.0]] * 4, [[1.0, 30.0, 60.0]] * 4]
@@ -171,10 +172,6 @@ def test_a_motion_falls_into_its_bends() -> None:
 def test_a_motion_without_its_parts_is_refused(seen: Float, match: str) -> None:
     with pytest.raises(FitError, match=match):
         guided(seen)
-
-
-def mirrored(uv: Float, _name: str) -> Float:
-    return np.stack([639.0 - uv[:, 0], uv[:, 1]], axis=1)
 
 
 def no_tips(uv: Float, name: str) -> Float:
