@@ -20,15 +20,28 @@ from common.errors import BusError, CalibrationError
 from common.messages import CheckItem, Checklist
 from common.messages.streams import MASTER
 from master.checklist.facts import CameraPlan, Plan, keys_of
+from master.commands.options import rigs_of
 from master.run.process import join_bus
 
 ANSWER_S = 3.0  # a master reports once a second
 
 
 def check(options: Namespace) -> int:
-    """Print current problems; return exit code 1 if there is any, else 0."""
+    """Print current problems; return exit code 1 if there is any, else 0.
+
+    Without a master: that, and what is wrong with the files that one would read.
+    """
     items: tuple[CheckItem, ...] = ()
-    connection = join_bus(options.bus, options.site)
+    try:
+        connection = join_bus(options.bus, options.site)
+    except BusError as error:
+        rigs = rigs_of(options)
+        start = f"`phalanx run --rig {' --rig '.join(rigs)}` starts one; --bus names that of another machine"
+        echo(f"no_master  {options.bus}\n  {error}\n  -> {start}.")
+        if (options.calibration / "rigs").is_dir():
+            nothing = Plan(cameras=(), imus=(), groups=())
+            echo("\n".join(lines(judge(options.calibration, tuple(rigs), nothing), "the files are well")))
+        return 1
     try:
         lists = connection.subscribe("checklist", MASTER)
         items = newest(lists, options.bus)
@@ -52,10 +65,10 @@ def newest(lists: Subscription, where: str) -> tuple[CheckItem, ...]:
     return answer.items
 
 
-def lines(items: tuple[CheckItem, ...]) -> list[str]:
-    """The list for a person."""
+def lines(items: tuple[CheckItem, ...], well: str = "all is well") -> list[str]:
+    """The list for a person; `well`: there is nothing on it."""
     if not items:
-        return ["all is well"]
+        return [well]
     wide = max(len(item.code) for item in items)
     out: list[str] = []
     for item in items:

@@ -84,15 +84,18 @@ def console(command: ArgumentParser) -> None:
 def check(command: ArgumentParser) -> None:
     """List what is wrong with a running rig, and what to do.
 
-    Exit code 1 if there is anything, 0 if all is well.
+    Exit code 1 if there is anything, 0 if all is well. Where no master runs, the files of the rig are looked at.
 
     What each line means, how it is measured and what to do: docs/checklist.md.
 
     Examples:
       phalanx check
       phalanx check --watch
+      phalanx check --rig wrist --calibration DIR
       phalanx check --keys DIR --bus tls/192.168.1.2:47802 && echo ready
     """
+    add_rigs(command)
+    add_calibration(command)
     add_bus(command)
     add_site(command)
     add_flag(command, "--watch", "go on until Ctrl-C, and print the list whenever it changes")

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,9 @@ from typing import Any
 import pytest
 
 from master.checklist.facts import Plan, plan_of
-from master.checklist.files import FileMonitor
+from master.checklist.files import FileMonitor, check
 from master.rig.setup import load_setups
+from tests.network_helpers import free_endpoint
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -31,6 +33,17 @@ def tree(tmp_path: Path) -> Path:
         lens = {"provenance": {"intrinsics": _measured("2026-01-10")}}
         _edit(tree / f"cameras/{name}.json", lambda file, lens=lens: file | lens)
     return tree
+
+
+def test_without_a_master_the_files_are_checked(tree: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _edit(tree / "cameras/left.json", lambda file: file | {"intrinsics": None})
+    options = Namespace(bus=free_endpoint(), site=None, rig=None, calibration=tree, watch=False)
+    assert check(options) == 1
+    printed = capsys.readouterr().out
+    assert printed.startswith("no_master")
+    assert "`phalanx run --rig desk` starts one" in printed
+    assert "Camera left: its lens is not measured.\n  -> `phalanx calibrate cameras intrinsics`." in printed
+    assert "Camera right" not in printed
 
 
 def _edit(path: Path, change: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
