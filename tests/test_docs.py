@@ -1,18 +1,25 @@
 """The documents agree with the code where a machine can tell."""
 
+import contextlib
 import functools
+import io
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
 import msgspec
+import pytest
 
 from bench.__main__ import ALL
 from common.calibration import HandProfile, RigCalibration, parse
+from common.errors import PhalanxError
 from common.hand.model import FINGERS, JOINTS, HandModel
 from common.hand.profiles import generated_profile
+from master.cli.table import program
+from slave.cli.table import PROGRAM
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted({*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "calib_json").rglob("*.md")})
@@ -238,3 +245,49 @@ def test_every_reference_to_a_source_has_its_anchor() -> None:
     others = {name for text in texts().values() for name in re.findall(r"sources\.md#([\w-]+)", text)}
     assert others
     assert (own | others) - set(anchors) == set()
+
+
+def commands_of(page: str) -> list[list[str]]:
+    """Command lines of ours in the blocks of a page, without the remark behind them; a line's first word leads."""
+    fenced = re.findall(r"```\w*\n(.*?)```", page, re.DOTALL)
+    lines = "".join([*fenced, *re.findall(r"(?:^    \S.*\n)+", page, re.MULTILINE)]).replace("\\\n", " ")
+    found = re.findall(r"^[ $#]*(?:sudo )?(?:\S*/)?(phalanx(?:-slave)?) ([^&|;#\n]*)", lines, re.MULTILINE)
+    remark = r" {2,}(?![-$])(?!.* -)\S.*"  # two blanks, and no option behind them
+    return [shlex.split(f"{name} {re.sub(remark, '', words)}") for name, words in found]
+
+
+def refused(words: list[str]) -> str:
+    """Why the program does not take the words; empty: it does, or a file of the example is not here."""
+    said = io.StringIO()
+    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+        try:
+            (program() if words[0] == "phalanx" else PROGRAM).parse(words[1:])
+        except SystemExit as end:
+            return said.getvalue() if end.code else ""
+        except PhalanxError as error:
+            return "" if "no such folder" in str(error) else str(error)
+    return ""
+
+
+# What stands for words of the reader's.
+STANDS_FOR = {"$T0": "0", "csv|parquet|bvh|gltf|rrd": "csv"}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_every_command_of_a_page_is_one(page: Path) -> None:
+    text = page.read_text() if page.name != "CHANGELOG.md" else ""  # of commands that were
+    for mark, word in STANDS_FOR.items():
+        text = text.replace(mark, word)
+    found = [words for words in commands_of(text) if not {"...", "$S"} & {*words}]
+    assert {" ".join(words): why for words in found if (why := refused(words))} == {}
+
+
+def test_the_check_of_commands_sees_what_is_none() -> None:
+    page = "```\nphalanx check --wach   looks\nsudo phalanx-slave doctor\nphalanx run \\\n    --rig desk  # so\n```\n"
+    words = commands_of(page)
+    assert words == [
+        ["phalanx", "check", "--wach"],
+        ["phalanx-slave", "doctor"],
+        ["phalanx", "run", "--rig", "desk"],
+    ]
+    assert [bool(refused(one)) for one in words] == [True, False, False]
