@@ -1,4 +1,4 @@
-# Every target sets itself up: a fresh clone needs Python 3.11-3.13, make and a package registry, nothing else.
+# Every target sets itself up: a fresh clone needs Python 3.11-3.14, make and a package registry, nothing else.
 .DEFAULT_GOAL := help
 .PHONY: help install demo browser emulator hosts-tools api test test-bare test-deploy test-nightly check format audit bench soak scale faults hostile instructions schema clean
 .DELETE_ON_ERROR:
@@ -25,8 +25,8 @@ STAMP := .venv/.installed
 # The default rig of a scene is not named, so that DEMO_ARGS may name a scene or a rig of its own.
 DEMO_RIG := $(filter-out desk,$(RIG))
 DEMO_OUT := out/demo$(addprefix -,$(DEMO_RIG))
-# Fits: 3.11-3.13, and able to make a virtual environment (Debian splits ensurepip off into python3-venv).
-FITS := import sys, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
+# Fits: 3.11-3.14, and able to make a virtual environment (Debian splits ensurepip off into python3-venv).
+FITS := import sys, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | while IFS="$$(printf '\t')" read -r target text; do printf '  make %-12s %s\n' "$$target" "$$text"; done
@@ -127,11 +127,11 @@ clean: ## remove .venv, out/ and caches
 # A virtual environment moved or half made is worse than none: any change of the inputs makes it afresh.
 $(STAMP): pyproject.toml constraints.txt
 	@set -eu; found=; \
-	for python in $(if $(PYTHON),"$(PYTHON)",python3 python3.13 python3.12 python3.11); do \
+	for python in $(if $(PYTHON),"$(PYTHON)",python3 python3.14 python3.13 python3.12 python3.11); do \
 	  if "$$python" -c '$(FITS)' >/dev/null 2>&1; then found="$$python"; break; fi; \
 	done; \
 	if [ -z "$$found" ]; then \
-	  echo "make: no fitting Python$(if $(PYTHON), in PYTHON=$(PYTHON)): Phalanx needs 3.11, 3.12 or 3.13 with venv (Debian: apt install python3-venv);" >&2; \
+	  echo "make: no fitting Python$(if $(PYTHON), in PYTHON=$(PYTHON)): Phalanx needs 3.11 to 3.14 with venv (Debian, Ubuntu: apt install python3-venv);" >&2; \
 	  echo "      name one: make install PYTHON=/path/to/python3.12" >&2; exit 1; \
 	fi; \
 	echo "installing into .venv with $$("$$found" -V) ..."; \

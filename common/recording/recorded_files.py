@@ -172,7 +172,7 @@ def refuse_links(folder: Path, names: Iterable[str]) -> None:
             mode = path.lstat().st_mode if path.exists() or path.is_symlink() else stat.S_IFREG
             if not inside[parent] or (stat.S_ISLNK(mode) and not path.resolve().is_relative_to(root)):
                 raise RecordingError(f"{path}: leads to {path.resolve()}, outside the recording's folder")
-            if not stat.S_ISREG(mode) and not path.is_file():
+            if not stat.S_ISREG(mode) and not stat.S_ISREG(path.stat().st_mode):
                 raise RecordingError(f"{path}: must be a plain file")
     except (OSError, RuntimeError) as error:  # a link to itself
         raise RecordingError(f"{folder}: its links cannot be followed: {error}") from error

@@ -172,19 +172,19 @@ class QueryControl(c.Structure):
 class QueryMenu(c.Structure):
     """struct v4l2_querymenu, packed."""
 
-    _pack_ = 1
+    _pack_, _layout_ = 1, "ms"
     _fields_ = [("id", c.c_uint32), ("index", c.c_uint32), ("name", c.c_char * 32), ("reserved", c.c_uint32)]
 
 
 class _ControlValue(c.Union):
-    _pack_ = 1
+    _pack_, _layout_ = 1, "ms"
     _fields_ = [("value", c.c_int32), ("value64", c.c_int64)]
 
 
 class ControlValue(c.Structure):
     """struct v4l2_ext_control, packed."""
 
-    _pack_ = 1
+    _pack_, _layout_ = 1, "ms"
     _fields_ = [*_words("id", "size", "reserved2"), ("of", _ControlValue)]
 
 

@@ -187,7 +187,7 @@ def check_host(system: System) -> Iterator[Finding]:
     if OLDEST <= sys.version_info[:2] <= NEWEST:
         yield ok("Python", f"{version} in {sys.prefix}")
     else:
-        yield fail("Python", version, "Python 3.11 to 3.13")
+        yield fail("Python", version, "Python 3.11 to 3.14")
     yield from _metrics(system)
     yield _memory_limit(system)
     yield _throttled(system)

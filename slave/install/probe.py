@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 PACKAGES = ("chrony", "python3-picamera2", "rsync")
-OLDEST, NEWEST = (3, 11), (3, 13)
+OLDEST, NEWEST = (3, 11), (3, 14)
 MACHINES = ("aarch64", "x86_64")
 RELEASES = "opt/phalanx"
 _FIND_CAMERAS = (
@@ -66,7 +66,7 @@ def judge(facts: dict[str, Any], camera: str = "", apt: bool = True) -> str | No
         have = ".".join(map(str, python))
         return f"its Python is {have}, needs 3.11 or newer: Raspberry Pi OS Bookworm or Trixie has that"
     if python > NEWEST:
-        return f"its Python is {'.'.join(map(str, python))}, for which not all wheels are there; needs 3.11 to 3.13"
+        return f"its Python is {'.'.join(map(str, python))}, for which not all wheels are there; needs 3.11 to 3.14"
     if not facts["venv"]:
         return "its Python cannot make virtual environments: apt install python3-venv"
     if not facts["systemd"]:

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import bvhio
 import numpy as np
 import pytest
 
@@ -13,7 +12,7 @@ from master.mocap.bvh_file import read_bvh
 from master.mocap.read import Reading, read_motion
 from master.recording.export.bvh import Axes
 from tests.master.recording.export.made import poses_of, positions
-from tests.master.recording.export.test_export_bvh import written
+from tests.master.recording.export.test_export_bvh import reader, written
 
 # Written for this test: two joints beside their parents in other orders of channels, one with a place of its own.
 SMALL = """HIERARCHY
@@ -60,6 +59,7 @@ Frame Time: 0.0083333
 
 def other_reader(path: Path) -> dict[str, Float]:
     """Places (T, 3) of all joints as bvhio reads them."""
+    bvhio = reader()
     bvh = bvhio.readAsBvh(str(path))
     root = bvhio.convertBvhToHierarchy(bvh.Root).loadRestPose(recursive=True)
     frames: list[dict[str, list[float]]] = []

@@ -195,7 +195,7 @@ def test_what_config_txt_says_already_is_not_said_again() -> None:
         ({"bits": 32}, "", "needs a 64-bit system"),
         ({"machine": "armv7l"}, "", "needs a 64-bit system"),
         ({"python": [3, 9]}, "", "its Python is 3.9, needs 3.11 or newer"),
-        ({"python": [3, 14]}, "", "needs 3.11 to 3.13"),
+        ({"python": [3, 15]}, "", "needs 3.11 to 3.14"),
         ({"venv": False}, "", "apt install python3-venv"),
         ({"systemd": False}, "", "systemd does not run there"),
         ({"root": False}, "", "user pi may not become root without a password"),
