@@ -36,6 +36,30 @@ def remark(text: str) -> None:
     echo(text, error=True)
 
 
+# What is written for Linux alone, by `sys.platform`; tests/test_portable.py holds that nothing else is.
+_NOT_ON = "phalanx demo, run --install and fleet; v4l2 and picamera2 cameras, lights and IMUs on I2C"
+_NOT_HERE = {
+    "darwin": f"macOS (nobody has tried it yet) lacks {_NOT_ON}, the same-user check of a console without password",
+    "win32": f"Windows (nobody has tried it yet) lacks {_NOT_ON}, IMUs on a serial port, trackers of libsurvive, the "
+    "same-user check of a console without password, the check that others cannot read keys, and an orderly end of what "
+    "the console starts",
+}
+
+
+def check_system(platform: str, utf8_mode: int) -> None:
+    """State what does not work on this system, by name.
+
+    Raises:
+        PhalanxError: It would read and write files in another encoding than UTF-8.
+    """
+    if platform == "win32" and not utf8_mode:
+        raise PhalanxError(
+            "set PYTHONUTF8=1: files of Phalanx are UTF-8, this Python would read them otherwise"
+        )
+    if platform in _NOT_HERE:
+        remark(f"{_NOT_HERE[platform]}; cameras on USB: --camera opencv:INDEX")
+
+
 DONE, FAILED, WRONG_USAGE = 0, 1, 2
 _EXAMPLES = "Examples:"
 _HELP = ("-h", "--help")
@@ -142,7 +166,8 @@ class Program:
             except ModuleNotFoundError as error:
                 if (error.name or "").split(".")[0] in _OURS:
                     raise
-                echo(f"{self.name}: {error.name} is missing: {self.missing}", error=True)
+                fix = "this needs Linux" if error.name in sys.stdlib_module_names else self.missing
+                echo(f"{self.name}: {error.name} is missing: {fix}", error=True)
                 return FAILED
             except KeyboardInterrupt:
                 echo(f"\n{self.name}: interrupted", error=True)
@@ -163,6 +188,7 @@ class Program:
 
     def _run(self, words: Sequence[str]) -> int:
         command, options = self.parse(words)
+        check_system(sys.platform, sys.flags.utf8_mode)
         try:
             return int(_function(command.work)(options) or DONE)
         except UsageError as error:

@@ -11,11 +11,14 @@ import logging
 import os
 import signal
 import socket
+import subprocess
 import threading
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 
 EXIT_CODE = 70  # EX_SOFTWARE of sysexits.h
+# Beside `start_new_session` for Popen: Ctrl-C is for us, and we end the child in good order.
+NEW_GROUP: int = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)  # of Windows, which has no sessions
 _LOG = logging.getLogger(__name__)
 
 
@@ -79,6 +82,7 @@ def until(stopped: Callable[[], bool], work: Callable[[], None]) -> Callable[[],
     return run
 
 
+_UNIX: int = getattr(socket, "AF_UNIX", 0)  # Windows has neither these nor such managers
 MAIN, WATCHDOG, WATCHDOG_PID = "NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"
 
 
@@ -92,7 +96,7 @@ class ServiceManager:
 
     def __init__(self, environment: Mapping[str, str]) -> None:
         """Find out who listens, from the environment of the process; nothing is sent yet."""
-        self._address = _address(environment.get(MAIN, ""))
+        self._address = _address(environment.get(MAIN, "")) if _UNIX else None
         self.listens = self._address is not None
         self.watchdog_us = _watchdog_us(environment) if self.listens else 0
 
@@ -104,8 +108,9 @@ class ServiceManager:
         if self._address is None:
             return True
         try:
-            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as to:
-                to.sendto(text.encode(), 0 if wait else socket.MSG_DONTWAIT, self._address)
+            with socket.socket(_UNIX, socket.SOCK_DGRAM) as to:
+                to.setblocking(wait)
+                to.sendto(text.encode(), self._address)
         except OSError as error:
             if wait:
                 _LOG.warning("%s: cannot reach the service manager: %s", MAIN, error)

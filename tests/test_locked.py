@@ -85,7 +85,8 @@ def requirements(root: Path, *extras: str) -> list[Requirement]:
     """What the project asks for, with these extras."""
     project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
     optional = project["optional-dependencies"]
-    return [Requirement(text) for text in sum((optional[one] for one in extras), project["dependencies"])]
+    texts = [*project["dependencies"], *(text for extra in extras for text in optional[extra])]
+    return [Requirement(text) for text in texts]
 
 
 ALL = ("master", "fast", "wrist", "vive", "lsl", "ximu3", "dev")
@@ -127,7 +128,7 @@ def test_all_that_is_needed_has_wheels(
     ]
     names = closure(asked, [about])
     lines = [line for line in (root / "constraints.txt").read_text().splitlines() if _EXACT.fullmatch(line)]
-    exact = {canonicalize_name(line.partition("==")[0]): line for line in lines}
+    exact: dict[str, str] = {canonicalize_name(line.partition("==")[0]): line for line in lines}
     assert {canonicalize_name(one.name) for one in asked} <= names & exact.keys()
     found = wheels(python, machine, [exact.get(name, name) for name in sorted(names - {"pip"})], tmp_path)
     assert len(found) == len(names - {"pip"})

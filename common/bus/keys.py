@@ -26,6 +26,7 @@ Who is given the rig key alone has the secrets that follow from it. A folder wit
 command that adds them, and does not make the rig weaker in silence.
 """
 
+import os
 import secrets
 import stat
 from collections.abc import Mapping
@@ -42,6 +43,8 @@ from common.errors import BusError, PhalanxError
 from common.link.datagram import KEY_BYTES, LinkKey
 
 MASTER, OPERATOR = "master", "operator"
+# Bits of a private file's mode that must not be set; Windows has other rules and shows them all.
+OTHERS = 0 if os.name == "nt" else stat.S_IRWXG | stat.S_IRWXO
 LIFE = timedelta(days=3652)
 FIRST_DAY = datetime(1970, 1, 1, tzinfo=UTC)
 CLOCK_FIX = (
@@ -285,8 +288,7 @@ def _others_read(path: Path, what: str, environment: Mapping[str, str]) -> str |
     """
     folder = environment.get(_CREDENTIALS)
     handed = folder is not None and path.parent == Path(folder)
-    forbidden = stat.S_IRWXO if handed else stat.S_IRWXG | stat.S_IRWXO
-    if path.stat().st_mode & forbidden:
+    if path.stat().st_mode & (OTHERS & stat.S_IRWXO if handed else OTHERS):
         return f"{path}: others can read {what}; run: chmod 600 {path}"
     return None
 

@@ -296,9 +296,6 @@ class UdpSocket:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         receive_buffer = 1 << 20
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
-        # The kernel's own receive timeout: `settimeout` would make `send` wait as well.
-        timeout = struct.pack("ll", 0, round(timeout_s * 1e6))
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, timeout)
         try:
             self._socket.bind(bind)
         except OSError as error:
@@ -307,6 +304,9 @@ class UdpSocket:
             why = "another program has it, perhaps another master" if taken else error.strerror
             raise BusError(f"cannot bind UDP {bind[0]}:{bind[1]}: {why}") from error
         self.address: Address = self._socket.getsockname()
+        self._socket.settimeout(timeout_s)
+        self._at_once = self._socket.dup()  # the same socket, which never waits
+        self._at_once.setblocking(False)
         self.would_block = 0
         self.failed = 0
 
@@ -315,26 +315,24 @@ class UdpSocket:
 
         One that is too long comes cut to one byte more than allowed, so that it is seen to be.
         """
-        return self._receive(0)
+        return self._receive(self._socket)
 
     def receive_waiting(self) -> tuple[bytes, Address] | None:
         """As `receive`, of what has come already: None at once where nothing has."""
-        return self._receive(socket.MSG_DONTWAIT)
+        return self._receive(self._at_once)
 
-    def _receive(self, flags: int) -> tuple[bytes, Address] | None:
+    def _receive(self, one: socket.socket) -> tuple[bytes, Address] | None:
         try:
-            return self._socket.recvfrom(MAX_DATAGRAM + 1, flags)
-        except (BlockingIOError, InterruptedError):
-            return None
+            return one.recvfrom(MAX_DATAGRAM + 1)
         except OSError as error:
             if error.errno in (errno.EBADF, errno.ENOTSOCK):
                 raise
-            return None  # a delayed ICMP complaint about an earlier send: not our concern
+            return None  # nothing came, or a delayed ICMP complaint about an earlier send: not our concern
 
     def send(self, datagram: bytes, to: Address) -> bool:
         """Send now or not at all; whether the kernel took it."""
         try:
-            self._socket.sendto(datagram, socket.MSG_DONTWAIT, to)
+            self._at_once.sendto(datagram, to)
         except BlockingIOError:
             self.would_block += 1
         except OSError:
@@ -346,3 +344,4 @@ class UdpSocket:
     def close(self) -> None:
         """Give the address back."""
         self._socket.close()
+        self._at_once.close()

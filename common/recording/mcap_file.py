@@ -302,7 +302,7 @@ def messages_of(
 
 
 def _content(path: Path, fd: int, size: int) -> McapContent:
-    first = next(_traverse(fd, len(MAGIC), size), None) if os.pread(fd, len(MAGIC), 0) == MAGIC else None
+    first = next(_traverse(fd, len(MAGIC), size), None) if _read(fd, len(MAGIC), 0) == MAGIC else None
     header = _header(fd, first)
     if header is None:
         raise RecordingError(f"{path}: no recording of messages: it does not begin as an MCAP file")
@@ -312,7 +312,7 @@ def _content(path: Path, fd: int, size: int) -> McapContent:
 def _traverse(fd: int, at: int, end: int) -> Iterator[_Place]:
     """Records from `at` on, up to the first that is none or ends beyond `end`."""
     while at + HEAD.size <= end:
-        opcode, length = HEAD.unpack(os.pread(fd, HEAD.size, at))
+        opcode, length = HEAD.unpack(_read(fd, HEAD.size, at))
         at += HEAD.size
         if length > end - at or opcode == 0:  # a hole in a file reads as zeros without end
             return
@@ -320,23 +320,28 @@ def _traverse(fd: int, at: int, end: int) -> Iterator[_Place]:
         at += length
 
 
+def _read(fd: int, length: int, at: int) -> bytes:
+    os.lseek(fd, at, os.SEEK_SET)
+    return os.read(fd, length)
+
+
 def _bytes(fd: int, length: int, at: int) -> bytes:
     """Read `length` bytes from position `at`; empty outside the file."""
-    return os.pread(fd, length, at) if 0 < length <= os.fstat(fd).st_size - at else b""
+    return _read(fd, length, at) if 0 < length <= os.fstat(fd).st_size - at else b""
 
 
 def _header(fd: int, place: _Place | None) -> Header | None:
     if place is None or place[0] != Opcode.HEADER or place[2] > BOUNDS.around_bytes:
         return None
     try:
-        return Header.read(stream(os.pread(fd, place[2], place[1])))
+        return Header.read(stream(_read(fd, place[2], place[1])))
     except BROKEN:
         return None
 
 
 def _indexed(fd: int, size: int, profile: str) -> McapContent | None:
     """Content of a file by the summary at its end; None: missing, broken, too large."""
-    tail = os.pread(fd, HEAD.size + _FOOTER.size + len(MAGIC), max(size - 37, 0))
+    tail = _read(fd, HEAD.size + _FOOTER.size + len(MAGIC), max(size - 37, 0))
     if len(tail) != 37 or tail[:1] != bytes([Opcode.FOOTER]) or tail[-len(MAGIC) :] != MAGIC:
         return None
     footer = Footer(*_FOOTER.unpack(tail[9:29]))

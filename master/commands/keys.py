@@ -28,6 +28,7 @@ from common.bus.keys import (
     DEVICES_KEY,
     MASTER,
     OPERATOR,
+    OTHERS,
     RIG_KEY,
     KeyPair,
     Shown,
@@ -71,7 +72,7 @@ def make(folder: Path, devices: Iterable[str], now: datetime) -> list[str]:
 
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if folder.stat().st_mode & 0o077:
+        if folder.stat().st_mode & OTHERS:
             raise PhalanxError(
                 f"{folder}: others can enter it; give a folder of its own, or run: chmod 700 {folder}"
             )

@@ -18,7 +18,8 @@ from contextlib import suppress
 from typing import IO
 
 from common.errors import PhalanxError
-from master.console.process_supervisor import ENDS_S
+from common.supervisor import NEW_GROUP
+from master.console.process_supervisor import ENDS_S, KILL, send
 
 _KILLED_S = 2.0
 _CHUNK = 8192
@@ -40,11 +41,13 @@ class LocalProcess:
         try:
             self._child = subprocess.Popen(
                 self.command,
+                bufsize=0,  # a line that nobody takes is not kept
                 env={**os.environ, "PYTHONUNBUFFERED": "1", **environment},
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
+                creationflags=NEW_GROUP,
             )
         except OSError as error:
             raise PhalanxError(f"{name}: cannot start {self.command[0]}: {error.strerror}") from error
@@ -71,31 +74,26 @@ class LocalProcess:
         """A line for its keyboard, as Enter; nothing happens once it has ended."""
         with suppress(OSError, ValueError):  # it ended meanwhile, which `ended` reports
             self._keyboard.write(f"{line}\n".encode())
-            self._keyboard.flush()
 
     def interrupt(self) -> None:
         """Ask it to end (SIGINT), as Ctrl-C does; does not wait."""
         self.stopped = True
-        self._signal(signal.SIGINT)
+        send(self._child.pid, signal.SIGINT)
 
     def stop(self, ends_s: float = ENDS_S) -> int:
         """Stop it, after `ends_s` [s] by killing, and return its exit code."""
         self.stopped = True
         if self._child.poll() is None:
-            self._signal(signal.SIGTERM)
+            send(self._child.pid, signal.SIGTERM)
             try:
                 self._child.wait(ends_s)
             except subprocess.TimeoutExpired:
-                self._signal(signal.SIGKILL)
+                send(self._child.pid, KILL)
                 self._child.wait(_KILLED_S)
         self._reader.join(_KILLED_S)
         with suppress(OSError):  # what was not read any more
             self._keyboard.close()
         return self._child.returncode
-
-    def _signal(self, number: int) -> None:
-        with suppress(ProcessLookupError):  # ended by itself
-            os.killpg(self._child.pid, number)
 
     def _read(self, output: IO[bytes]) -> None:
         decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")
@@ -122,6 +120,7 @@ class LocalProcesses:
                 stdin=subprocess.PIPE,
                 text=True,
                 start_new_session=True,
+                creationflags=NEW_GROUP,
             )
         except OSError as error:
             raise PhalanxError(f"console: cannot start {sys.executable}: {error.strerror}") from error

@@ -40,6 +40,7 @@ from common.messages import (
     ResultMessage,
 )
 from common.messages.streams import MASTER
+from common.supervisor import NEW_GROUP
 from master.outputs.bus import PictureAsker
 from master.outputs.poses import Poses, PosesTruth
 from master.outputs.rerun_blueprint import blueprint
@@ -92,7 +93,8 @@ class ViewerProcess:
                     stdin=subprocess.DEVNULL,
                     stdout=errors,
                     stderr=errors,
-                    start_new_session=True,  # Ctrl-C is for us; we end the viewer in good order
+                    start_new_session=True,
+                    creationflags=NEW_GROUP,
                 )
         except (OSError, subprocess.SubprocessError) as error:
             self._folder.cleanup()

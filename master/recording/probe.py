@@ -25,6 +25,7 @@ from common.clock import Clock
 from common.errors import BusError, RecordingError
 from common.messages import Backlog, Message
 from common.messages.streams import MASTER, sender_of
+from common.supervisor import NEW_GROUP
 from master.outputs.bus import Receive
 from master.outputs.worker import Worker
 from master.rig.setup import RigFiles
@@ -164,6 +165,7 @@ class RecorderProcess:
             stderr=subprocess.STDOUT,
             text=True,
             start_new_session=True,
+            creationflags=NEW_GROUP,
         )
         self._last = ""
         self._thread = threading.Thread(target=self._listen, name="recorder lines", daemon=True)

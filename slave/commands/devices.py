@@ -23,7 +23,6 @@ from common.imu.fusion import OrientationFilter
 from slave.cameras.grey import Pixels
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
-from slave.cameras.v4l2 import V4l2Camera, V4l2Options, device_path
 from slave.commands.options import clock_of, world_of
 from slave.drivers import CAMERAS, IMUS, LIGHTS, REAL_IMUS, REAL_TRACKERS, SWITCHED_LIGHTS, TRACKERS
 from slave.lights.interlock import Interlock
@@ -91,6 +90,8 @@ def open_camera(
             connection_lost("opens the camera, in step with others", patience_s)
         opener = lambda file: Picamera2Camera(file, pi, clock, stop)  # noqa: E731
     elif kind == "v4l2":
+        from slave.cameras.v4l2 import V4l2Camera, V4l2Options, device_path
+
         codes = _codes(options.control)
         usb = V4l2Options(device_path(place), codes, tuple(options.allow_missing), pixels)
         opener = lambda file: V4l2Camera(file, usb, clock)  # noqa: E731

@@ -15,13 +15,12 @@ import importlib
 import logging
 import os
 import socket
-import sys
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
-from pathlib import Path
 from typing import Any, ClassVar, cast
 
 import numpy as np
+import psutil
 
 from common.arrays import Float
 from common.calibration.output_settings import LslOutput
@@ -33,22 +32,13 @@ from master.outputs.network.conventions import MasterTimes
 
 _LOOPBACK = b"lo\0"
 _ANYWHERE = frozenset({"0.0.0.0", "::"})
-_FOLDER = Path("/proc/self/fd")
-Socket = tuple[int, str]
+_BOUND_TO_DEVICE: int | None = getattr(socket, "SO_BINDTODEVICE", None)  # Linux alone has it
+Socket = tuple[int, object]
 
 
 def sockets() -> frozenset[Socket]:
-    """Return descriptor and kernel name of all sockets of this process.
-
-    The name, because another socket may have the number later; none where the system does not report them.
-    """
-    found: set[Socket] = set()
-    if _FOLDER.is_dir():
-        for entry in _FOLDER.iterdir():
-            with suppress(OSError):  # closed meanwhile
-                if (name := str(entry.readlink())).startswith("socket:"):
-                    found.add((int(entry.name), name))
-    return frozenset(found)
+    """Return descriptor and address of all IP sockets of this process."""
+    return frozenset((one.fd, one.laddr) for one in psutil.Process().net_connections("inet"))
 
 
 def keep_here(before: Collection[Socket], ports: range) -> bool:
@@ -74,10 +64,10 @@ def _listening(descriptors: Iterable[int], ports: range) -> Iterator[socket.sock
 
 
 def _bound(one: socket.socket) -> bool:
-    if sys.platform != "linux":
+    if _BOUND_TO_DEVICE is None:
         return False
     try:
-        one.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _LOOPBACK)
+        one.setsockopt(socket.SOL_SOCKET, _BOUND_TO_DEVICE, _LOOPBACK)
     except OSError:  # before Linux 5.7 only root may
         return False
     return True

@@ -9,23 +9,20 @@ browser. The browser asks once; what it shows is compared with the fingerprint t
 import os
 import socket
 import ssl
-import stat
-import struct
-import sys
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
 from pathlib import Path
 
+import psutil
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from common.bus.endpoints import loopback
-from common.bus.keys import OPEN
+from common.bus.keys import OPEN, OTHERS
 from common.errors import PhalanxError
 
 LIFE = timedelta(days=397)  # browsers refuse a longer life
@@ -92,7 +89,7 @@ def read_private(path: Path) -> bytes:
             data = file.read(most_bytes)
     except OSError as error:
         raise PhalanxError(f"{path}: cannot be read: {error.strerror}") from error
-    if mode & (stat.S_IRWXG | stat.S_IRWXO):
+    if mode & OTHERS:
         raise PhalanxError(f"{path}: others can read it; run: chmod 600 {path}")
     return data
 
@@ -124,23 +121,9 @@ def places_of(host: str) -> tuple[str, ...]:
 
 
 def _addresses() -> list[str]:
-    """IPv4 addresses of this machine: on Linux of each network, else of its name."""
-    found: list[str] = []
-    if sys.platform == "linux":
-        from fcntl import ioctl
-
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            for _, name in socket.if_nameindex():
-                with suppress(OSError):  # it has none
-                    siocgifaddr = 0x8915  # netdevice(7)
-                    address = ioctl(probe.fileno(), siocgifaddr, struct.pack("256s", name.encode()[:15]))
-                    found.append(socket.inet_ntoa(address[20:24]))
-    else:
-        with suppress(OSError):
-            found += [
-                str(one[4][0]) for one in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)
-            ]
-    return found
+    """IPv4 addresses of this machine, in each network."""
+    cards = psutil.net_if_addrs().values()
+    return [one.address for card in cards for one in card if one.family == socket.AF_INET]
 
 
 def _fits(pem: bytes, host: str, now: datetime) -> bool:

@@ -20,7 +20,6 @@ from slave.cameras.grey import GREY_FORMATS, Pixels, grey, luma
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
-from slave.commands import devices
 from slave.preview import small_jpeg, whole_jpeg
 from slave.report import DetectionCounters
 from slave.sender import WristPipeline, run
@@ -304,7 +303,7 @@ def test_a_real_wrist_camera_is_recorded_grey(tmp_path: Path, monkeypatch: pytes
     def fake(file: CameraCalibration, asked: V4l2Options, clock: Any) -> V4l2Camera:
         return V4l2Camera(file, asked, clock, lambda _path: FakeDevice(strobed_camera()))
 
-    monkeypatch.setattr(devices, "V4l2Camera", fake)
+    monkeypatch.setattr("slave.cameras.v4l2.V4l2Camera", fake)
     out = tmp_path / "rec"
     command = [
         "record",

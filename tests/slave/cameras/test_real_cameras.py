@@ -39,7 +39,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[V4l2Options]:
         options.append(asked)
         return V4l2Camera(calibration, asked, clock, lambda _path: FakeDevice(Camera()))
 
-    monkeypatch.setattr(devices, "V4l2Camera", make)
+    monkeypatch.setattr("slave.cameras.v4l2.V4l2Camera", make)
     return options
 
 
