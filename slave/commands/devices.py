@@ -1,12 +1,13 @@
-"""Open the device that an option names: camera, IMU, tracker or lights.
+"""Open what options name: files, clocks, keys; camera, IMU, tracker, lights.
 
-None is chosen silently: a name that is not in `slave.drivers`, or a place that is not of its form, is an error of the
-device's class that lists what there is. A driver is imported where it is opened, so other commands start without its
+No driver is chosen silently: a name that is not in `slave.drivers`, or a place that is not of its form, is an error
+of its class that lists what there is. A driver is imported where it is opened, so other commands start without its
 library. What is no recording is opened again when it was lost, until `stop` is set; `connection_lost` is called when
-that, or opening, takes time.
+that, or opening, takes time. A file or key that is not as it must be raises the `PhalanxError` of its kind.
 """
 
 import argparse
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -23,7 +24,6 @@ from common.imu.fusion import OrientationFilter
 from slave.cameras.grey import Pixels
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
-from slave.commands.options import clock_of, world_of
 from slave.drivers import CAMERAS, IMUS, LIGHTS, REAL_IMUS, REAL_TRACKERS, SWITCHED_LIGHTS, TRACKERS
 from slave.lights.interlock import Interlock
 from slave.reconnect import ReconnectingCamera, ReconnectingDriver, ReconnectingTracker
@@ -31,7 +31,79 @@ from slave.service import LOST_PATIENCE_S, ConnectionLost, ConnectionLostFor, no
 from slave.sources import FrameSource, ImuSource, TrackerSource
 
 if TYPE_CHECKING:
+    from common.bus.keys import Access
+    from common.link.datagram import LinkKey
     from slave.lights.strobed import SimulatedStrobe
+
+DEFAULT_RIG = "desk"
+DEFAULT_TREE = Path("calib_json")
+
+
+def rig_of(options: argparse.Namespace, typical: str = DEFAULT_RIG) -> RigCalibration:
+    """The rig; `typical` if none is named."""
+    return load(rig_path(options, typical), RigCalibration)
+
+
+def camera_of(options: argparse.Namespace) -> tuple[RigCalibration, CameraCalibration]:
+    """The rig, and the camera of this slave."""
+    rig = rig_of(options)
+    if options.name not in rig.cameras:
+        raise CalibrationError(
+            f"rig {rig.name!r} has no camera {options.name!r}; it has {', '.join(rig.cameras)}"
+        )
+    return rig, load(camera_path(options, options.name), CameraCalibration)
+
+
+def objects_of(options: argparse.Namespace, rig: RigCalibration) -> dict[str, ObjectProfile]:
+    """The objects of the rig, by name."""
+    return {name: load(tree_of(options) / "objects" / f"{name}.json", ObjectProfile) for name in rig.objects}
+
+
+def tree_of(options: argparse.Namespace) -> Path:
+    """The calib_json tree."""
+    return options.calibration or DEFAULT_TREE
+
+
+def rig_path(options: argparse.Namespace, typical: str = DEFAULT_RIG) -> Path:
+    """The rig file; of the rig `typical` if none is named."""
+    return tree_of(options) / "rigs" / f"{options.rig or typical}.json"
+
+
+def camera_path(options: argparse.Namespace, camera: str) -> Path:
+    """The file of a camera."""
+    return tree_of(options) / "cameras" / f"{camera}.json"
+
+
+def world_of(options: argparse.Namespace, rig: RigCalibration) -> tuple[Path, RigCalibration, str, int]:
+    """Folder and rig of the simulated world, and name and seed of its scene.
+
+    See `slave.commands.simulated.world_of`.
+    """
+    from slave.commands.simulated import world_of as world
+
+    return *world(tree_of(options), rig, options.truth, options.truth_rig), options.scene, options.seed
+
+
+def clock_of(options: argparse.Namespace, true_clock: Clock) -> SkewedClock:
+    """The slave's clock, which a simulated machine may have ahead of the true one."""
+    return SkewedClock(round(options.clock_offset_ms * 1e6), options.clock_ppm, true_clock)
+
+
+def skew_of(options: argparse.Namespace, true_clock: Clock) -> str:
+    """How the slave's clock differs from the machine's, to compare recordings by."""
+    skewed = f" {options.clock_offset_ms:+g} ms" if options.clock_offset_ms else ""
+    return skewed + (f" {options.clock_ppm:+g} ppm from {true_clock.now_ns()}" if options.clock_ppm else "")
+
+
+def secrets_of(options: argparse.Namespace) -> "tuple[LinkKey, Access]":
+    """What this device seals its datagrams by, and how it comes to the bus."""
+    from common.bus.keys import access_of, link_key
+
+    access = access_of(os.environ, options.name, options.keys, options.open)
+    if access.folder is not None:
+        access.identity()  # reported now, not when a master is received
+    return link_key(os.environ, options.key_file, options.keys, options.name), access
+
 
 SYNTHETIC = "synthetic"
 REAL_CAMERAS = ("picamera2", "v4l2")

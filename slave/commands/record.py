@@ -18,9 +18,17 @@ from common.calibration import CameraCalibration, RigCalibration, load
 from common.clock import Clock, SystemClock
 from common.command_line import UsageError, echo, remark
 from common.errors import CalibrationError, CameraError, PhalanxError
-from slave.commands.devices import Drivers, orientation_of
+from slave.commands.devices import (
+    Drivers,
+    camera_of,
+    camera_path,
+    clock_of,
+    objects_of,
+    orientation_of,
+    skew_of,
+    world_of,
+)
 from slave.commands.join import import_foreign, join
-from slave.commands.options import camera_of, camera_path, clock_of, objects_of, skew_of, world_of
 from slave.commands.run import import_table_of_imu
 from slave.service import stop_by_signal
 

@@ -19,8 +19,8 @@ from common.command_line import UsageError, echo
 from common.errors import CalibrationError, PhalanxError, RecordingError
 from common.imu.csv_table import ACCEL, GYRO, MAG, TIME
 from slave.commands import devices
-from slave.commands.devices import Drivers
-from slave.commands.options import (
+from slave.commands.devices import (
+    Drivers,
     camera_of,
     camera_path,
     objects_of,

@@ -15,8 +15,7 @@ from common.errors import LightsError
 from common.machine import program
 from common.recording.frame_recording import Illumination
 from slave.cli.table import PROGRAM
-from slave.commands.devices import imu_places, open_lights
-from slave.commands.options import camera_path, rig_of
+from slave.commands.devices import camera_path, imu_places, open_lights, rig_of
 from slave.doctor.devices import cameras_of, check_camera, check_devices, check_groups
 from slave.doctor.host import (
     Finding,
