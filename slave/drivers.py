@@ -5,6 +5,7 @@ from typing import TypeVar
 
 REAL_CAMERAS = "picamera2[:INDEX] | v4l2[:DEVICE]"
 CAMERAS = f"{REAL_CAMERAS} | synthetic | replay:FOLDER"
+SERVICE = "service"  # a camera of `record`: that of the running slave
 REAL_IMUS = "ximu3:PORT[@BAUD] | lsm6dsox:BUS[:ADDRESS]"
 IMUS = f"{REAL_IMUS} | synthetic"
 REAL_TRACKERS = "openvr | survive | survive:FILE"

@@ -33,6 +33,7 @@ from slave.preview import MarkerOverlay, Previews, WristOverlay
 from slave.raw import RawFrames, RawSettings
 from slave.report import DetectionCounters
 from slave.sender import MarkerPipeline, Sender, WristPipeline
+from slave.shared import FrameServer
 from slave.sources import Frame, FrameSource, Reporting
 from slave.tags.offline import LiveTags, finder_of
 from slave.tuning import CameraFiles, CameraTuning, Prepare, Sample
@@ -149,17 +150,21 @@ def send_detections(
     colours: Colours,
     scan: Scan,
     engine: Engine | WristEngine,
-    raw_frames: RawSettings | None = None,
+    raw_frames: RawSettings | None,
+    opened: dict[str, str],
+    skewed: str,
 ) -> None:
     """Detect in the frames of a camera and send until stopped.
 
     `colours`: those of markers follow the light, stay fixed, or nothing is detected; `scan` as of `ScanChoice`;
-    `engine` is that of markers or of a wrist device; `raw_frames`: where raw frames go when somebody asks for them.
+    `engine` is that of markers or of a wrist device; `raw_frames`: where raw frames go when somebody asks for them;
+    `opened`: options that opened the camera; `skewed`: how the slave's clock differs from the machine's.
     """
     workers = ThreadPoolExecutor(1, thread_name_prefix=f"{sender.name} colours")
     raw = RawFrames(
         sender.name, raw_frames, lambda: tuning.files, sender.clock, lambda: sender.uplink.started
     )
+    shared = FrameServer(sender.name, opened, lambda: tuning.files.camera, lambda: raw.manifest(skewed))
     if isinstance(engine, WristEngine):
         line = _wrist_line(sender, files, colours, engine)
     else:
@@ -167,11 +172,12 @@ def send_detections(
     counters = line.pipeline.counters
     tuning = CameraTuning(files, source, line.prepare, lambda: counters.total > 0, line.sample)
     sender.send(
-        raw.reading(source),
+        shared.reading(raw.reading(source)),
         line.pipeline,
+        skips=shared.wanted,
         previews=line.previews,
         parts=(tuning, raw),
-        close=(raw.close, lambda: workers.shutdown(cancel_futures=True)),
+        close=(shared.close, raw.close, lambda: workers.shutdown(cancel_futures=True)),
     )
 
 

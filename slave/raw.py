@@ -165,7 +165,7 @@ class RawFrames(Reporting):
             )
         recorder = Recorder(
             settings.folder / request.name,
-            self._manifest(settings),
+            self.manifest(settings.skewed),
             self._camera,
             Length(),
             reserve_bytes=settings.reserve_bytes,
@@ -177,7 +177,8 @@ class RawFrames(Reporting):
         self._last = self._recorder = recorder
         _LOG.info("raw frames into %s", settings.folder / request.name)
 
-    def _manifest(self, settings: RawSettings) -> Manifest:
+    def manifest(self, skewed: str) -> Manifest:
+        """Of a recording that begins now; `skewed` as of `RawSettings`."""
         files = self._files()
         others = {n: files.camera_path.with_name(f"{n}.json") for n in files.rig.cameras if n != self._camera}
         try:
@@ -191,7 +192,7 @@ class RawFrames(Reporting):
             kind=files.rig.kind,
             cameras={name: cameras.get(name, files.camera) for name in files.rig.cameras},
             rig=files.rig,
-            clock=clock_of(self._clock, settings.skewed),
+            clock=clock_of(self._clock, skewed),
             objects={profile.name: profile for profile in files.objects},
         )
 

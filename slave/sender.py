@@ -186,17 +186,18 @@ def wait_for_start(
     stop: threading.Event,
     alive: Callable[[], None] = nothing,
     skip: Callable[[], bool] | None = None,
+    skips: Callable[[], bool] = lambda: True,
 ) -> bool:
     """Wait for the master; False if stopped before, or the source has ended.
 
     `started` waits at most so many seconds for the start; `alive` is called every time round; `skip` reads an item
-    and forgets it, False at the end of the stream; None: nothing is read meanwhile.
+    and forgets it, False at the end of the stream; where it is None, or `skips` is not true now, nothing is read.
     """
-    wait_s = 0.2 if skip is None else 0.5e-3  # between two items
     while not stop.is_set():
-        if started(wait_s):
+        reads = skip is not None and skips()
+        if started(0.5e-3 if reads else 0.2):  # between two items
             return True
-        if skip is not None and not skip():
+        if skip is not None and reads and not skip():
             return False
         alive()
     return False
@@ -246,15 +247,15 @@ class Sender:
         source: Source[ItemT],
         pipeline: Pipeline[ItemT],
         *,
-        skips: bool = False,
+        skips: Callable[[], bool] = lambda: False,
         previews: "Previews | None" = None,
         parts: "Sequence[CameraTuning | RawFrames]" = (),
         close: Sequence[Callable[[], None]] = (),
     ) -> None:
         """Wait for the master, push items until `stop` or their end; close everything.
 
-        Where `skips`, items are read before the start, so that none grows old in a buffer: drivers of cameras throw
-        old frames away themselves; of a recording nothing is to be missed.
+        While `skips` is true, items are read before the start, so that none grows old in a buffer, or for those who
+        read beside it: drivers of cameras throw old frames away themselves; of a recording nothing is to be missed.
         """
         reporter = Reporter(
             self.name,
@@ -271,8 +272,8 @@ class Sender:
             gc.freeze()  # what lives until the end is never walked again: no pause in the loop
             self.notify("ready, waiting for the master")
             self.service.ready(lambda: self.uplink.started)
-            skip = partial(skip_one, source, pipeline) if skips else None
-            if wait_for_start(self.uplink.wait_for_start, self.stop, self.service.waiting, skip):
+            skip = partial(skip_one, source, pipeline)
+            if wait_for_start(self.uplink.wait_for_start, self.stop, self.service.waiting, skip, skips):
                 run(source, pipeline, self.stop, self.service.working)
         finally:
             self.service.stopping()
@@ -290,11 +291,11 @@ def send_samples(sender: Sender, source: ImuSource, orientation: OrientationFilt
     """Send what an IMU measures, with a filter's orientation; None: its own."""
     counters, uplink = imu_counters(source, orientation), sender.uplink
     orient = None if orientation is None else orientation.push
-    sender.send(source, ImuPipeline(uplink.session, uplink.send, counters, orient), skips=True)
+    sender.send(source, ImuPipeline(uplink.session, uplink.send, counters, orient), skips=lambda: True)
 
 
 def send_poses(sender: Sender, source: TrackerSource, recorded: bool = False) -> None:
     """Send where a tracker is; a `recorded` source begins with the start."""
     uplink = sender.uplink
     pipeline = PosePipeline(uplink.session, uplink.send, pose_counters(source))
-    sender.send(source, pipeline, skips=not recorded)
+    sender.send(source, pipeline, skips=lambda: not recorded)

@@ -119,9 +119,9 @@ class Service:
 
 
 @contextmanager
-def stop_by_signal() -> Generator[threading.Event, None, None]:
-    """An event that Ctrl-C and a stop by the system set while the block runs."""
-    stop = threading.Event()
+def stop_by_signal(event: threading.Event | None = None) -> Generator[threading.Event, None, None]:
+    """An `event`, or a new one, that Ctrl-C and a stop by the system set meanwhile."""
+    stop = threading.Event() if event is None else event
     before = {
         number: signal.signal(number, lambda _number, _frame: stop.set())
         for number in (signal.SIGINT, signal.SIGTERM)

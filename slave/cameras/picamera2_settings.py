@@ -16,6 +16,7 @@ states what to do.
 import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, Protocol, cast
 
 import numpy.typing as npt
@@ -23,7 +24,7 @@ import numpy.typing as npt
 from common.calibration import CameraCalibration
 from common.errors import CameraError
 from slave.cameras.grey import Pixels
-from slave.cameras.settings import Setting, as_values
+from slave.cameras.settings import Setting, as_values, users_of
 
 INSTALL = (
     "install it with `sudo apt install python3-picamera2 --no-install-recommends` (Raspberry Pi OS, 64 bit) and make "
@@ -128,8 +129,8 @@ def open_library(index: int) -> tuple[Library, Enums]:
         library = cast(Library, picamera2.Picamera2(index))
     except RuntimeError as error:
         raise CameraError(
-            f"--camera picamera2:{index}: cannot be opened ({error.__cause__ or error}); another program may "
-            "have it: stop that, or restart the Pi"
+            f"--camera picamera2:{index}: cannot be opened ({error.__cause__ or error}); "
+            f"{users_of(Path('/dev/media*'))}; else restart the Pi"
         ) from error
     sync = getattr(getattr(controls, "rpi", None), "SyncModeEnum", None)
     return library, Enums(

@@ -6,9 +6,12 @@ what to do. What changes settings of a running camera watches its frames go by (
 up.
 """
 
+import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Generic, TypeVar
 
 from common.calibration import CameraCalibration
@@ -84,6 +87,35 @@ def change(
 
 def _text_of(values: Sequence[float], unit: str) -> str:
     return ", ".join(f"{value:.6g}" for value in values) + (f" {unit}" if unit else "")
+
+
+def users_of(device: Path) -> str:
+    """Which other programs have a device (its name may be a pattern), and what to do.
+
+    By the locks that libcamera has on the media devices it uses (`MediaDevice::lock`), which everybody may read; else
+    by who has a device open, of which only root sees all.
+    """
+    paths = {path.resolve() for path in device.parent.glob(device.name)}
+    pids: set[str] = set()
+    with suppress(OSError):
+        inodes = {
+            f"{os.major(s.st_dev):02x}:{os.minor(s.st_dev):02x}:{s.st_ino}" for s in map(Path.stat, paths)
+        }
+        locks = [line.split() for line in Path("/proc/locks").read_text().splitlines()]
+        pids = {words[4] for words in locks if words[5] in inodes}
+    for process in () if pids else Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has ended, or is somebody else's
+            if any(link.resolve() in paths for link in process.glob("fd/*")):
+                pids.add(process.name)
+    users: list[str] = []
+    for pid in sorted(pids - {str(os.getpid())}, key=int):
+        with suppress(OSError):
+            words = Path(f"/proc/{pid}/cmdline").read_text(errors="replace").replace("\0", " ").strip()
+            unit = Path(f"/proc/{pid}/cgroup").read_text().strip().rpartition("/")[2]
+            users.append(f"`{words[:80]}` (process {pid}{', ' + unit if unit.endswith('.service') else ''})")
+    if users:
+        return f"another program has it: {', '.join(users)}: end that"
+    return f"another program may have it: `sudo fuser -v {device}` names it"
 
 
 T = TypeVar("T")

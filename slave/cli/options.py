@@ -6,7 +6,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 from common.command_line import count, megabytes, number, port, positive
-from slave.drivers import CAMERAS, IMU_UNITS, IMUS, LIGHTS, REAL_IMUS, SCANS, SWITCHED_LIGHTS, TRACKERS
+from slave.drivers import (
+    CAMERAS,
+    IMU_UNITS,
+    IMUS,
+    LIGHTS,
+    REAL_IMUS,
+    SCANS,
+    SERVICE,
+    SWITCHED_LIGHTS,
+    TRACKERS,
+)
 
 BEACON_PORT = 47800
 _START = "UDP port of the master's start (default: %(default)s)"
@@ -228,6 +238,8 @@ def record(command: ArgumentParser) -> None:
 
     Examples:
       phalanx-slave record --name left --rig desk --camera synthetic --seconds 10 -o recordings/wave-left
+      phalanx-slave record --name left --camera service --seconds 10 -o recordings/wave-left
+            what the running slave sees, while it tracks; docs/recording.md
       phalanx-slave record --name wrist --rig wrist --camera synthetic --imu ximu3:/dev/ttyACM0 --seconds 10 -o out
             the rig's IMU beside the camera, as imu.csv on the clock of the frames
       phalanx-slave record --join recordings/wave-left recordings/wave-right -o recordings/wave
@@ -245,7 +257,8 @@ def record(command: ArgumentParser) -> None:
             against a quaternion in it, how right the tilt is. Without -o it is only looked at
     """
     what = command.add_mutually_exclusive_group(required=True)
-    what.add_argument("--camera", metavar="DRIVER", help=CAMERAS)
+    text = "; the last one: of the running slave NAME, with its files; a camera that it has is read from it anyway"
+    what.add_argument("--camera", metavar="DRIVER", help=f"{CAMERAS} | {SERVICE}{text}")
     what.add_argument(
         "--join", type=Path, nargs="+", metavar="RECORDING", help="recordings to join, one folder per camera"
     )

@@ -8,11 +8,12 @@ import os
 import sys
 import threading
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import cv2
+from msgspec import structs
 
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.clock import Clock, SystemClock
@@ -30,7 +31,9 @@ from slave.commands.devices import (
 )
 from slave.commands.join import import_foreign, join
 from slave.commands.run import import_table_of_imu
+from slave.drivers import SERVICE
 from slave.service import stop_by_signal
+from slave.shared import SharedCamera
 
 if TYPE_CHECKING:
     from common.recording.frame_recording import Manifest
@@ -59,13 +62,19 @@ def record_camera(options: argparse.Namespace) -> int:
     from common.recording.frame_writing import refuse_occupied
     from slave.commands.simulated import add_imu, imu_of
 
-    rig, camera = camera_of(options)
-    drivers = _drivers(options, rig)
-    manifest = _manifest(drivers)
+    if options.camera == SERVICE and options.calibration is None and options.rig is None:
+        with closing(SharedCamera(options.name)) as shared:  # whose files are those of the recording
+            manifest, camera = structs.replace(shared.manifest, note=options.note), shared.camera
+        assert manifest.rig is not None  # of a running slave
+        drivers = _drivers(options, manifest.rig)
+    else:
+        rig, camera = camera_of(options)
+        drivers = _drivers(options, rig)
+        manifest = _manifest(drivers)
     refuse_occupied(options.output)  # before a camera is opened
     imu = None
     if options.imu == "synthetic":
-        imu = imu_of(str(options.camera), *world_of(options, rig))
+        imu = imu_of(str(options.camera), *world_of(options, drivers.rig))
     with _imu_recorder(drivers) as imu_recorder:
         done, failure = _record(drivers, camera, manifest, imu_recorder)
         if imu_recorder is not None and done.frames:
@@ -123,9 +132,9 @@ def _record(
     """Record to the end; how much, and the error that ended it early, if any."""
     from slave.recorder import Length, ProgressDisplay, Recorder, feed
 
-    options = drivers.options
+    options, stop = drivers.options, threading.Event()
     display = ProgressDisplay(options.name, sys.stderr)
-    source = drivers.camera(camera)
+    source = replace(drivers, reader=stop).camera(camera)
     try:
         recorder = Recorder(
             options.output,
@@ -139,7 +148,7 @@ def _record(
         try:
             if imu_recorder is not None:
                 imu_recorder.start(options.output)
-            with stop_by_signal() as stop:
+            with stop_by_signal(stop):
                 feed(source, recorder, stop)
         finally:
             recorder.close()

@@ -115,6 +115,7 @@ def send_camera(options: argparse.Namespace) -> int:
     """Detect and send until stopped."""
     from slave.live import send_detections
     from slave.markers import engine as marker_engine
+    from slave.shared import opened_by
     from slave.wrist import engine as wrist_engine
 
     service = Service(os.environ)
@@ -127,7 +128,8 @@ def send_camera(options: argparse.Namespace) -> int:
         drivers = Drivers.running(options, files.rig, stop, service.connection_lost)
         source = drivers.camera(files.camera)
         sender = _sender(options, secrets, drivers.clock, stop, service)
-        send_detections(sender, files, source, options.colours, options.scan, engine, raw)
+        opened, skewed = opened_by(options), skew_of(options, SystemClock())
+        send_detections(sender, files, source, options.colours, options.scan, engine, raw, opened, skewed)
     return 0
 
 

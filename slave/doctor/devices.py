@@ -1,8 +1,7 @@
 """Check the camera, and what devices the service may open.
 
 The camera opens, has every setting of its file with all automatics off, and delivers frames. One that the running
-service has cannot be opened a second time: of a V4L2 camera the automatics are read all the same; of another it is
-reported that it was not checked.
+service has cannot be opened a second time: its frames are asked for, and of a V4L2 camera the automatics are read.
 """
 
 import argparse
@@ -21,6 +20,7 @@ from slave.cameras.v4l2_abi import KernelDevice
 from slave.cameras.v4l2_controls import AUTOMATICS, read_back, read_controls
 from slave.commands import devices
 from slave.doctor.host import Finding, System, fail, ok, unseen
+from slave.shared import shared_camera
 
 GROUPS = ("video", "dialout", "i2c", "gpio")  # SupplementaryGroups of the unit; a test compares them
 DMA_HEAP = "/dev/dma_heap"
@@ -139,30 +139,33 @@ def check_camera(slave: argparse.Namespace, taken: bool) -> Iterator[Finding]:
     kind, _, place = str(slave.camera).partition(":")
     if kind not in devices.REAL_CAMERAS:
         yield unseen("camera", f"{slave.camera}: no device")
-    elif not taken:
-        yield _opened(slave, file, wrist=rig.kind == "wrist")
-    elif kind == "v4l2":
+        return
+    if taken and kind == "v4l2":
         yield _automatics(device_path(place))
-    else:
-        yield unseen(
-            "camera", "the running service has it, and read its settings back; else: systemctl stop it first"
-        )
+    yield _opened(slave, file, taken, wrist=rig.kind == "wrist")
 
 
-def _opened(slave: argparse.Namespace, file: CameraCalibration, *, wrist: bool) -> Finding:
-    """Open the camera as the slave does, settings included, and read some frames."""
+def _opened(slave: argparse.Namespace, file: CameraCalibration, taken: bool, *, wrist: bool) -> Finding:
+    """Open the camera as the slave does, or ask who has it, and read some frames."""
     found: list[Finding] = []
 
     def look() -> None:
+        text = "the running service has it, and gave {} frames of it"
         try:
-            camera = devices.open_camera(str(slave.camera), slave, file, SystemClock(), None, wrist=wrist)
+            camera = shared_camera(slave, None, None)
+            if camera is None and taken:
+                found.append(unseen("camera", "the running service has it, and does not share its frames"))
+                return
+            if camera is None:
+                camera = devices.open_camera(str(slave.camera), slave, file, SystemClock(), None, wrist=wrist)
+                text = "opens, has its settings, automatics off, {} frames read"
             assert camera is not None  # its driver is a real one
             with contextlib.closing(camera):
                 seen = sum(camera.read() is not None for _ in range(10))
         except PhalanxError as error:
             found.append(fail("camera", str(error), "as the error states; docs/cameras.md has the rest"))
         else:
-            found.append(ok("camera", f"opens, has its settings, automatics off, {seen} frames read"))
+            found.append(ok("camera", text.format(seen)))
 
     # In a thread of its own: a library that hangs must not hold up the other checks.
     thread = threading.Thread(target=look, name="doctor camera", daemon=True)
@@ -179,16 +182,18 @@ def _automatics(path: Path) -> Finding:
     try:
         device = KernelDevice(path)
     except OSError as error:
-        return fail("camera", f"{path}: {error.strerror}", "plug it in, or stop the program that has it")
+        return fail("automatics", f"{path}: {error.strerror}", "plug it in, or stop the program that has it")
     try:
         controls = read_controls(device)
         there = [Setting(name, (off,), 0.0, "", "") for name, off in AUTOMATICS.items() if name in controls]
         on = differences(there, read_back(device, controls, there))
     except OSError as error:
-        return fail("camera", f"{path}: cannot be asked: {error.strerror}", "unplug it and plug it in again")
+        return fail(
+            "automatics", f"{path}: cannot be asked: {error.strerror}", "unplug it and plug it in again"
+        )
     finally:
         device.close()
     if on:
         fix = "restart the service; stop other programs"
-        return fail("camera", f"automatics are on: {', '.join(on)}", fix)
-    return ok("camera", f"the service has it; {len(there)} automatics, all off")
+        return fail("automatics", f"on: {', '.join(on)}", fix)
+    return ok("automatics", f"{len(there)}, all off")

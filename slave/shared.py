@@ -1,0 +1,352 @@
+"""Give the frames of a running slave to other programs of this machine.
+
+    loop ── offer ──▶ bounded queue per reader ──▶ its thread ──▶ Unix socket ──▶ `SharedCamera` of another process
+
+A camera has one user. While a slave has it, `phalanx-slave record` and `doctor` read its frames, to the last bit, at a
+socket that no network reaches. The loop never waits: what a reader's queue has no room for is dropped, and counted
+for that reader. root, the slave's own user and members of group `video`, who may open cameras themselves, are served;
+everybody else is refused with what to do. A refusal, and a slave that is gone, raise `CameraError`.
+"""
+
+import argparse
+import grp
+import logging
+import os
+import queue
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import closing, suppress
+from pathlib import Path
+from socketserver import ThreadingUnixStreamServer
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+
+from common.calibration import CameraCalibration, parse
+from common.calibration.files import MAX_BYTES
+from common.clock import SystemClock
+from common.errors import CameraError, PhalanxError
+from common.machine import ROOT
+from common.recording.frame_recording import Illumination, Manifest
+from slave.cameras.v4l2 import device_path
+from slave.drivers import SERVICE
+from slave.raw import RawProbe
+from slave.reconnect import ReconnectingDriver
+from slave.sources import Frame, FrameSource
+
+# seq, t_ns, ready_t_ns, how many were dropped for this reader; t_sigma_ns, exposure_us; illumination, (H, W, C) of
+# the image, whose bytes follow; C = 0: grey
+_HEADER, _LENGTH = struct.Struct("<4q2d4I"), struct.Struct("<I")
+_LIT = tuple(Illumination)
+_OPENED = ("lights", "luma", "sync", "control", "clock_offset_ms", "clock_ppm")  # how a camera is opened
+_NO_SETTING = frozenset({"intrinsics", "markers", "roi_margin", "provenance"})  # of a camera file
+_LOG = logging.getLogger(__name__)
+
+
+class Offer(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """First answer of a slave: why a reader is refused, or what its frames are.
+
+    `opened`: options by which the camera was opened; `manifest`: of a recording of it now.
+    """
+
+    refused: str = ""
+    opened: dict[str, str] = {}
+    manifest: Manifest | None = None
+
+
+def opened_by(options: argparse.Namespace) -> dict[str, str]:
+    """Options of a command by which it opens its camera; empty: not given."""
+    return {key: str(getattr(options, key) or "") for key in ("camera", *_OPENED)}
+
+
+def _settings(opened: Mapping[str, str], camera: CameraCalibration) -> Mapping[str, object]:
+    """What decides how frames of a camera look, by options and keys of the file."""
+    stated = {f"--{key.replace('_', '-')}": opened.get(key, "") for key in _OPENED}
+    return stated | {k: v for k, v in msgspec.structs.asdict(camera).items() if k not in _NO_SETTING}
+
+
+class _Reader:
+    """A program that reads, and the frames that wait for it."""
+
+    def __init__(self, end: socket.socket, camera: CameraCalibration) -> None:
+        self.end, self.camera, self.frames, self.dropped = end, camera, 0, 0
+        most_bytes = 32_000_000  # of a slave on the smallest machine, 90 MB are left
+        capacity = max(most_bytes // (camera.width_px * camera.height_px * 3), 2)
+        self.waiting: queue.Queue[Frame | None] = queue.Queue(capacity)
+
+    def send_all(self) -> None:
+        """Send frames until None comes; OSError: nobody takes them."""
+        while (frame := self.waiting.get()) is not None:
+            height, width, channels = (*frame.image.shape, 0)[:3]
+            stamps = frame.seq, frame.t_ns, frame.ready_t_ns, self.dropped
+            shown = _LIT.index(frame.illumination), height, width, channels
+            self.end.sendall(_HEADER.pack(*stamps, frame.t_sigma_ns, frame.exposure_us, *shown))
+            self.end.sendall(np.ascontiguousarray(frame.image).data)
+            self.frames += 1
+
+    def stop(self) -> None:
+        """End at once."""
+        with suppress(OSError, queue.Full):
+            self.end.shutdown(socket.SHUT_RDWR)
+            self.waiting.put_nowait(None)
+
+
+class FrameServer:
+    """Offers the frames of a slave at a socket, where it has a folder for that."""
+
+    def __init__(
+        self,
+        name: str,
+        opened: dict[str, str],
+        camera: Callable[[], CameraCalibration],
+        manifest: Callable[[], Manifest],
+    ) -> None:
+        """Listen from now on; `camera` and `manifest` return what is in use now."""
+        self._name, self._opened, self._camera, self._manifest = name, opened, camera, manifest
+        self._lock, self._probe = threading.Lock(), None
+        self._readers: tuple[_Reader, ...] = ()  # replaced whole: the loop walks it without the lock
+        folder = os.environ.get("RUNTIME_DIRECTORY")  # of a service, by systemd
+        places = [Path(folder) / "frames"] if folder else _places(name)[1:]
+        self._server = _listening(places[0], self._serve) if places else None
+
+    def reading(self, source: FrameSource) -> FrameSource:
+        """The camera for the loop, all of whose frames are offered."""
+        if self._server is None:
+            return source
+        self._probe = RawProbe(source, self.offer)
+        return self._probe
+
+    def offer(self, frame: Frame) -> None:
+        """Queue a frame for all readers. Never waits."""
+        for reader in self._readers:
+            if (now := self._camera()) is not reader.camera and _settings({}, now) != _settings(
+                {}, reader.camera
+            ):
+                reader.stop()  # it was offered other settings
+                continue
+            try:
+                reader.waiting.put_nowait(frame)
+            except queue.Full:
+                reader.dropped += 1
+
+    def wanted(self) -> bool:
+        """Whether anybody reads."""
+        return bool(self._readers)
+
+    def close(self) -> None:
+        """End with the last frame that was read, as far as readers take it soon."""
+        if self._server is None:
+            return
+        self._server.shutdown()
+        self._server.server_close()
+        if self._probe is not None:
+            self._probe.flush()
+        until = time.monotonic() + 1.0  # seconds
+        for reader in self._readers:
+            with suppress(queue.Full):
+                reader.waiting.put(None, timeout=max(until - time.monotonic(), 0.0))
+        while self._readers and time.monotonic() < until:
+            time.sleep(0.01)
+        for reader in self._readers:
+            reader.stop()
+
+    def _serve(self, end: socket.socket, _address: object, _server: object) -> None:
+        """Serve one reader to its end, in a thread of its own."""
+        stuck_s = 10.0  # a reader that takes nothing for so long is given up
+        end.settimeout(stuck_s)
+        with suppress(OSError):
+            who, offer = self._offer(end)
+            text = msgspec.json.encode(offer)
+            end.sendall(_LENGTH.pack(len(text)) + text)
+            if offer.manifest is None:
+                _LOG.info("%s: its frames are refused to %s: %s", self._name, who, offer.refused)
+            elif end.recv(1):  # it has read the offer, and wants frames
+                self._read_by(_Reader(end, offer.manifest.cameras[self._name]), who)
+
+    def _read_by(self, reader: _Reader, who: str) -> None:
+        with self._lock:
+            self._readers = (*self._readers, reader)
+        _LOG.info("%s: its frames are read by %s", self._name, who)
+        with suppress(OSError):
+            reader.send_all()
+        with self._lock:
+            self._readers = tuple(one for one in self._readers if one is not reader)
+        _LOG.info("%s: %d frames read by %s, %d dropped", self._name, reader.frames, who, reader.dropped)
+
+    def _offer(self, end: socket.socket) -> tuple[str, Offer]:
+        """Who asks, by the kernel, and the answer."""
+        pid, user, group = struct.unpack("3i", end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+        peer_groups, most = 59, 2  # SO_PEERGROUPS of Linux; readers
+        groups = [group, *memoryview(end.getsockopt(socket.SOL_SOCKET, peer_groups, 1024)).cast("I")]
+        who = f"process {pid} of user {user}"
+        with suppress(KeyError):  # no such group
+            if user in (0, os.geteuid()) or grp.getgrnam("video").gr_gid in groups:
+                if len(self._readers) >= most:
+                    return who, Offer(f"{most} programs read its frames already: end one of them")
+                try:
+                    return who, Offer(opened=self._opened, manifest=self._manifest())
+                except PhalanxError as error:
+                    return who, Offer(str(error))
+        how = "`sudo usermod -aG video $USER`, then log in again; or use sudo"
+        return who, Offer(f"its frames are for root and group video: {how}")
+
+
+def _listening(path: Path, serve: Callable[..., None]) -> ThreadingUnixStreamServer | None:
+    """A server at a path, in place of one that died; None, logged: there is none."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        server = ThreadingUnixStreamServer(str(path), serve)  # type: ignore[arg-type]
+        path.chmod(0o666)  # who asks is looked at
+    except OSError as error:
+        _LOG.warning("%s: its frames are not shared: %s", path, error.strerror or error)
+        return None
+    server.daemon_threads = True
+    threading.Thread(target=server.serve_forever, name="shared frames", daemon=True).start()
+    return server
+
+
+def _places(name: str) -> list[Path]:
+    """Where a service has its socket; then, in a session, a slave of its user."""
+    folders = [os.environ.get(ROOT, "/") + "/run", os.environ.get("XDG_RUNTIME_DIR")]
+    return [Path(folder) / "phalanx" / name / "frames" for folder in folders if folder]
+
+
+class SharedCamera:
+    """A `FrameSource`: frames of the slave `name` of this machine, from now on."""
+
+    def __init__(self, name: str, stop: threading.Event | None = None) -> None:
+        """Ask for its frames, and wait for each until `stop`."""
+        self._slave, self._stop, self._asked, self._dropped = f"slave {name!r}", stop, False, 0
+        self._end = _connected(name)
+        try:
+            (length,) = _LENGTH.unpack(self._bytes(_LENGTH.size))
+            self.offer = parse(bytes(self._bytes(min(length, MAX_BYTES))), Offer, f"offer of {self._slave}")
+            if self.offer.manifest is None:
+                raise CameraError(f"{self._slave}: {self.offer.refused}")
+            self.manifest = self.offer.manifest
+            self.camera = self.manifest.cameras[name]
+        except BaseException:
+            self.close()
+            raise
+
+    def read(self) -> Frame | None:
+        """The next frame; None once stopped."""
+        if not self._asked:
+            self._end.sendall(b"+")
+            self._asked = True
+        if not (header := self._bytes(_HEADER.size)):
+            return None
+        seq, t_ns, ready_ns, self._dropped, sigma_ns, exposure_us, lit, *size = _HEADER.unpack(header)
+        shape = tuple(size) if size[2] else tuple(size[:2])
+        if shape[:2] != (self.camera.height_px, self.camera.width_px) or shape[2:] not in ((), (3,)):
+            raise CameraError(f"{self._slave}: frames of {shape}, which are not of its camera file")
+        if not (pixels := self._bytes(int(np.prod(shape)))):
+            return None
+        image = np.frombuffer(pixels, np.uint8).reshape(shape)
+        return Frame(seq, t_ns, ready_ns, image, _LIT[int(lit)], sigma_ns, exposure_us)
+
+    def close(self) -> None:
+        """Leave. Safe to call twice."""
+        self._end.close()
+        if self._dropped:
+            _LOG.warning("%s: %d frames dropped: this program was too slow", self._slave, self._dropped)
+        self._dropped = 0
+
+    def _bytes(self, count: int) -> bytearray:
+        """So many bytes; none once stopped."""
+        patience_s = 10.0
+        data, until = bytearray(count), time.monotonic() + patience_s
+        left = memoryview(data)
+        while left:
+            try:
+                got = self._end.recv_into(left)
+            except TimeoutError:
+                if self._stop is not None and self._stop.is_set():
+                    return bytearray()
+                if time.monotonic() > until:
+                    raise CameraError(
+                        f"{self._slave}: no frame for {patience_s:g} s: its camera is away"
+                    ) from None
+                continue
+            except OSError as error:
+                raise CameraError(f"{self._slave}: {error.strerror}") from error
+            if not got:
+                raise CameraError(f"{self._slave} has ended, or given this reader up: its log states why")
+            left = left[got:]
+        return data
+
+
+class _NoSlaveError(CameraError):
+    """No slave of that name shares its frames here."""
+
+
+def _connected(name: str) -> socket.socket:
+    for path in _places(name):
+        end = socket.socket(socket.AF_UNIX)
+        end.settimeout(0.2)  # of one wait: then it is looked whether to stop
+        try:
+            end.connect(str(path))
+        except (FileNotFoundError, ConnectionRefusedError):
+            end.close()
+            continue
+        except OSError as error:
+            end.close()
+            raise CameraError(f"slave {name!r}: {path}: {error.strerror or error}; use sudo") from error
+        return end
+    how = f"`systemctl status phalanx-slave@{name}`"
+    raise _NoSlaveError(f"no slave {name!r} shares its frames on this machine: {how}")
+
+
+def shared_camera(
+    options: argparse.Namespace, camera: CameraCalibration | None, stop: threading.Event | None
+) -> FrameSource | None:
+    """Frames of the slave that has the camera which `options` name; None: none has it.
+
+    It has the settings of `camera`, where one is given. Lost, it is waited for until `stop`; without, that is an error.
+    """
+    name, own = str(options.name), opened_by(options)
+    asked = own["camera"] == SERVICE
+    try:
+        with closing(SharedCamera(name, stop)) as first:
+            if not asked and _device(own["camera"]) != _device(first.offer.opened["camera"]):
+                return None
+            rate_hz = first.camera.frame_rate_hz
+    except _NoSlaveError:
+        if asked:
+            raise
+        return None
+
+    def opener() -> SharedCamera:
+        source = SharedCamera(name, stop)
+        theirs = _settings(source.offer.opened, source.camera)
+        wanted = theirs if camera is None else _settings(own, camera)
+        not_given = ("", "off") if asked else ()
+        wrong = [
+            f"{k} {theirs[k]}, not {v}" for k, v in wanted.items() if v != theirs[k] and v not in not_given
+        ]
+        if not wrong:
+            return source
+        source.close()
+        how = f"give the same, take it as it is (--camera {SERVICE}), or `sudo systemctl stop phalanx-slave@{name}`"
+        raise CameraError(f"slave {name!r} has the camera, with {'; '.join(wrong)}: {how}")
+
+    def lost(what: str) -> None:
+        longest_s = 30.0  # a slave is back after some seconds, one that was stopped never
+        if source.metrics()["away_s"] > longest_s:
+            raise CameraError(what)
+
+    if stop is None:
+        return opener()
+    source = ReconnectingDriver(f"slave {name}", opener, SystemClock(), stop, lost, rate_hz=rate_hz)
+    return source
+
+
+def _device(driver: str) -> str:
+    """A real camera as its device; another driver as it is."""
+    kind, _, place = driver.partition(":")
+    return os.path.realpath(device_path(place)) if kind == "v4l2" else f"{kind}:{place or 0}"
