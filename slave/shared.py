@@ -16,9 +16,9 @@ import queue
 import socket
 import struct
 import threading
-import time
 from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
+from io import BufferedRWPair
 from pathlib import Path
 from socketserver import ThreadingUnixStreamServer
 
@@ -29,10 +29,12 @@ from msgspec import Struct
 from common.calibration import CameraCalibration, parse
 from common.calibration.files import MAX_BYTES
 from common.clock import SystemClock
+from common.command_line import remark
 from common.errors import CameraError, PhalanxError
 from common.machine import ROOT
 from common.recording.frame_recording import Illumination, Manifest
 from slave.cameras.v4l2 import device_path
+from slave.cameras.v4l2_controls import TIMEOUT_S
 from slave.drivers import SERVICE
 from slave.raw import RawProbe
 from slave.reconnect import ReconnectingDriver
@@ -63,28 +65,34 @@ def opened_by(options: argparse.Namespace) -> dict[str, str]:
     return {key: str(getattr(options, key) or "") for key in ("camera", *_OPENED)}
 
 
-def _settings(opened: Mapping[str, str], camera: CameraCalibration) -> Mapping[str, object]:
-    """What decides how frames of a camera look, by options and keys of the file."""
-    stated = {f"--{key.replace('_', '-')}": opened.get(key, "") for key in _OPENED}
-    return stated | {k: v for k, v in msgspec.structs.asdict(camera).items() if k not in _NO_SETTING}
+def _settings(camera: CameraCalibration, opened: Mapping[str, str]) -> Mapping[str, object]:
+    """What decides how frames of a camera look, by keys of the file and options."""
+    of_file = {k: v for k, v in msgspec.structs.asdict(camera).items() if k not in _NO_SETTING}
+    return of_file | {f"--{key.replace('_', '-')}": opened[key] for key in _OPENED}
 
 
 class _Reader:
     """A program that reads, and the frames that wait for it."""
 
-    def __init__(self, end: socket.socket, camera: CameraCalibration) -> None:
-        self.end, self.camera, self.frames, self.dropped = end, camera, 0, 0
-        most_bytes = 32_000_000  # of a slave on the smallest machine, 90 MB are left
+    def __init__(self, end: socket.socket, camera: CameraCalibration, settings: Mapping[str, object]) -> None:
+        self.end, self.settings, self.frames, self.dropped = end, settings, 0, 0
+        most_bytes = 32_000_000  # the smallest machine leaves 90 MB
         capacity = max(most_bytes // (camera.width_px * camera.height_px * 3), 2)
         self.waiting: queue.Queue[Frame | None] = queue.Queue(capacity)
 
     def send_all(self) -> None:
         """Send frames until None comes; OSError: nobody takes them."""
         while (frame := self.waiting.get()) is not None:
-            height, width, channels = (*frame.image.shape, 0)[:3]
-            stamps = frame.seq, frame.t_ns, frame.ready_t_ns, self.dropped
-            shown = _LIT.index(frame.illumination), height, width, channels
-            self.end.sendall(_HEADER.pack(*stamps, frame.t_sigma_ns, frame.exposure_us, *shown))
+            stamps = (
+                frame.seq,
+                frame.t_ns,
+                frame.ready_t_ns,
+                self.dropped,
+                frame.t_sigma_ns,
+                frame.exposure_us,
+            )
+            shape = (*frame.image.shape, 0)[:3]
+            self.end.sendall(_HEADER.pack(*stamps, _LIT.index(frame.illumination), *shape))
             self.end.sendall(np.ascontiguousarray(frame.image).data)
             self.frames += 1
 
@@ -107,26 +115,30 @@ class FrameServer:
     ) -> None:
         """Listen from now on; `camera` and `manifest` return what is in use now."""
         self._name, self._opened, self._camera, self._manifest = name, opened, camera, manifest
-        self._lock, self._probe = threading.Lock(), None
+        self._lock, self._server = threading.Lock(), None
         self._readers: tuple[_Reader, ...] = ()  # replaced whole: the loop walks it without the lock
         folder = os.environ.get("RUNTIME_DIRECTORY")  # of a service, by systemd
-        places = [Path(folder) / "frames"] if folder else _places(name)[1:]
-        self._server = _listening(places[0], self._serve) if places else None
+        for path in [Path(folder) / "frames"] if folder else _places(name)[1:]:
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.unlink(missing_ok=True)  # of a slave that died
+                self._server = ThreadingUnixStreamServer(str(path), self._serve)  # type: ignore[arg-type]
+                path.chmod(0o666)  # the kernel states who asks
+            except OSError as error:
+                _LOG.warning("%s: its frames are not shared: %s: %s", name, path, error.strerror or error)
+                return
+            self._server.daemon_threads = True
+            threading.Thread(target=self._server.serve_forever, name=f"{name} shared", daemon=True).start()
 
     def reading(self, source: FrameSource) -> FrameSource:
         """The camera for the loop, all of whose frames are offered."""
-        if self._server is None:
-            return source
-        self._probe = RawProbe(source, self.offer)
-        return self._probe
+        return source if self._server is None else RawProbe(source, self.offer)
 
     def offer(self, frame: Frame) -> None:
         """Queue a frame for all readers. Never waits."""
         for reader in self._readers:
-            if (now := self._camera()) is not reader.camera and _settings({}, now) != _settings(
-                {}, reader.camera
-            ):
-                reader.stop()  # it was offered other settings
+            if _settings(self._camera(), self._opened) != reader.settings:
+                reader.stop()  # it was offered others
                 continue
             try:
                 reader.waiting.put_nowait(frame)
@@ -138,19 +150,10 @@ class FrameServer:
         return bool(self._readers)
 
     def close(self) -> None:
-        """End with the last frame that was read, as far as readers take it soon."""
-        if self._server is None:
-            return
-        self._server.shutdown()
-        self._server.server_close()
-        if self._probe is not None:
-            self._probe.flush()
-        until = time.monotonic() + 1.0  # seconds
-        for reader in self._readers:
-            with suppress(queue.Full):
-                reader.waiting.put(None, timeout=max(until - time.monotonic(), 0.0))
-        while self._readers and time.monotonic() < until:
-            time.sleep(0.01)
+        """End; what still waits is lost."""
+        if self._server is not None:
+            self._server.shutdown()
+            self._server.server_close()
         for reader in self._readers:
             reader.stop()
 
@@ -164,8 +167,9 @@ class FrameServer:
             end.sendall(_LENGTH.pack(len(text)) + text)
             if offer.manifest is None:
                 _LOG.info("%s: its frames are refused to %s: %s", self._name, who, offer.refused)
-            elif end.recv(1):  # it has read the offer, and wants frames
-                self._read_by(_Reader(end, offer.manifest.cameras[self._name]), who)
+            elif end.recv(1):  # it wants frames, not only the offer
+                camera = offer.manifest.cameras[self._name]
+                self._read_by(_Reader(end, camera, _settings(camera, self._opened)), who)
 
     def _read_by(self, reader: _Reader, who: str) -> None:
         with self._lock:
@@ -181,33 +185,18 @@ class FrameServer:
         """Who asks, by the kernel, and the answer."""
         pid, user, group = struct.unpack("3i", end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
         peer_groups, most = 59, 2  # SO_PEERGROUPS of Linux; readers
-        groups = [group, *memoryview(end.getsockopt(socket.SOL_SOCKET, peer_groups, 1024)).cast("I")]
+        groups = {group, *memoryview(end.getsockopt(socket.SOL_SOCKET, peer_groups, 1024)).cast("I")}
         who = f"process {pid} of user {user}"
-        with suppress(KeyError):  # no such group
-            if user in (0, os.geteuid()) or grp.getgrnam("video").gr_gid in groups:
-                if len(self._readers) >= most:
-                    return who, Offer(f"{most} programs read its frames already: end one of them")
-                try:
-                    return who, Offer(opened=self._opened, manifest=self._manifest())
-                except PhalanxError as error:
-                    return who, Offer(str(error))
-        how = "`sudo usermod -aG video $USER`, then log in again; or use sudo"
-        return who, Offer(f"its frames are for root and group video: {how}")
-
-
-def _listening(path: Path, serve: Callable[..., None]) -> ThreadingUnixStreamServer | None:
-    """A server at a path, in place of one that died; None, logged: there is none."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.unlink(missing_ok=True)
-        server = ThreadingUnixStreamServer(str(path), serve)  # type: ignore[arg-type]
-        path.chmod(0o666)  # who asks is looked at
-    except OSError as error:
-        _LOG.warning("%s: its frames are not shared: %s", path, error.strerror or error)
-        return None
-    server.daemon_threads = True
-    threading.Thread(target=server.serve_forever, name="shared frames", daemon=True).start()
-    return server
+        video = {one.gr_gid for one in grp.getgrall() if one.gr_name == "video"}
+        if user not in (0, os.geteuid()) and not groups & video:
+            how = "`sudo usermod -aG video $USER`, then log in again; or use sudo"
+            return who, Offer(f"its frames are for root and group video: {how}")
+        if len(self._readers) >= most:
+            return who, Offer(f"{most} programs read its frames already: end one of them")
+        try:
+            return who, Offer(opened=self._opened, manifest=self._manifest())
+        except PhalanxError as error:
+            return who, Offer(str(error))
 
 
 def _places(name: str) -> list[Path]:
@@ -216,13 +205,17 @@ def _places(name: str) -> list[Path]:
     return [Path(folder) / "phalanx" / name / "frames" for folder in folders if folder]
 
 
+class _NoSlaveError(CameraError):
+    """No slave of that name shares its frames here."""
+
+
 class SharedCamera:
     """A `FrameSource`: frames of the slave `name` of this machine, from now on."""
 
-    def __init__(self, name: str, stop: threading.Event | None = None) -> None:
-        """Ask for its frames, and wait for each until `stop`."""
-        self._slave, self._stop, self._asked, self._dropped = f"slave {name!r}", stop, False, 0
-        self._end = _connected(name)
+    def __init__(self, name: str) -> None:
+        """Ask what it offers; frames are sent from the first `read` on."""
+        self._slave, self._asked, self._dropped = f"slave {name!r}", False, 0
+        self._file = _connected(name)
         try:
             (length,) = _LENGTH.unpack(self._bytes(_LENGTH.size))
             self.offer = parse(bytes(self._bytes(min(length, MAX_BYTES))), Offer, f"offer of {self._slave}")
@@ -234,70 +227,48 @@ class SharedCamera:
             self.close()
             raise
 
-    def read(self) -> Frame | None:
-        """The next frame; None once stopped."""
+    def read(self) -> Frame:
+        """The next frame."""
         if not self._asked:
-            self._end.sendall(b"+")
+            self._file.write(b"+")
+            self._file.flush()
             self._asked = True
-        if not (header := self._bytes(_HEADER.size)):
-            return None
-        seq, t_ns, ready_ns, self._dropped, sigma_ns, exposure_us, lit, *size = _HEADER.unpack(header)
-        shape = tuple(size) if size[2] else tuple(size[:2])
-        if shape[:2] != (self.camera.height_px, self.camera.width_px) or shape[2:] not in ((), (3,)):
-            raise CameraError(f"{self._slave}: frames of {shape}, which are not of its camera file")
-        if not (pixels := self._bytes(int(np.prod(shape)))):
-            return None
-        image = np.frombuffer(pixels, np.uint8).reshape(shape)
+        header = _HEADER.unpack(self._bytes(_HEADER.size))
+        seq, t_ns, ready_ns, self._dropped, sigma_ns, exposure_us, lit, *shape = header
+        shape = shape if shape[2] else shape[:2]
+        image = np.frombuffer(self._bytes(int(np.prod(shape))), np.uint8).reshape(shape)
         return Frame(seq, t_ns, ready_ns, image, _LIT[int(lit)], sigma_ns, exposure_us)
 
     def close(self) -> None:
         """Leave. Safe to call twice."""
-        self._end.close()
+        self._file.close()
         if self._dropped:
             _LOG.warning("%s: %d frames dropped: this program was too slow", self._slave, self._dropped)
         self._dropped = 0
 
     def _bytes(self, count: int) -> bytearray:
-        """So many bytes; none once stopped."""
-        patience_s = 10.0
-        data, until = bytearray(count), time.monotonic() + patience_s
-        left = memoryview(data)
-        while left:
+        data = bytearray(count)
+        try:
+            if self._file.readinto(data) == count:
+                return data
+        except TimeoutError as error:
+            raise CameraError(f"{self._slave}: no frame for {TIMEOUT_S:g} s: its camera is away") from error
+        except OSError as error:
+            raise CameraError(f"{self._slave}: {error.strerror}") from error
+        raise CameraError(f"{self._slave} has ended, or given this reader up: its log states why")
+
+
+def _connected(name: str) -> BufferedRWPair:
+    for path in _places(name):
+        with socket.socket(socket.AF_UNIX) as end:
+            end.settimeout(TIMEOUT_S)
             try:
-                got = self._end.recv_into(left)
-            except TimeoutError:
-                if self._stop is not None and self._stop.is_set():
-                    return bytearray()
-                if time.monotonic() > until:
-                    raise CameraError(
-                        f"{self._slave}: no frame for {patience_s:g} s: its camera is away"
-                    ) from None
+                end.connect(str(path))
+                return end.makefile("rwb")
+            except (FileNotFoundError, ConnectionRefusedError):
                 continue
             except OSError as error:
-                raise CameraError(f"{self._slave}: {error.strerror}") from error
-            if not got:
-                raise CameraError(f"{self._slave} has ended, or given this reader up: its log states why")
-            left = left[got:]
-        return data
-
-
-class _NoSlaveError(CameraError):
-    """No slave of that name shares its frames here."""
-
-
-def _connected(name: str) -> socket.socket:
-    for path in _places(name):
-        end = socket.socket(socket.AF_UNIX)
-        end.settimeout(0.2)  # of one wait: then it is looked whether to stop
-        try:
-            end.connect(str(path))
-        except (FileNotFoundError, ConnectionRefusedError):
-            end.close()
-            continue
-        except OSError as error:
-            end.close()
-            raise CameraError(f"slave {name!r}: {path}: {error.strerror or error}; use sudo") from error
-        return end
+                raise CameraError(f"slave {name!r}: {path}: {error.strerror or error}; use sudo") from error
     how = f"`systemctl status phalanx-slave@{name}`"
     raise _NoSlaveError(f"no slave {name!r} shares its frames on this machine: {how}")
 
@@ -305,15 +276,17 @@ def _connected(name: str) -> socket.socket:
 def shared_camera(
     options: argparse.Namespace, camera: CameraCalibration | None, stop: threading.Event | None
 ) -> FrameSource | None:
-    """Frames of the slave that has the camera which `options` name; None: none has it.
+    """Frames of the slave that has the camera that `options` name, or None.
 
     It has the settings of `camera`, where one is given. Lost, it is waited for until `stop`; without, that is an error.
     """
     name, own = str(options.name), opened_by(options)
-    asked = own["camera"] == SERVICE
+    asked, device = own["camera"] == SERVICE, _device(own["camera"])
+    if not (asked or device):
+        return None
     try:
-        with closing(SharedCamera(name, stop)) as first:
-            if not asked and _device(own["camera"]) != _device(first.offer.opened["camera"]):
+        with closing(SharedCamera(name)) as first:
+            if not asked and device != _device(first.offer.opened["camera"]):
                 return None
             rate_hz = first.camera.frame_rate_hz
     except _NoSlaveError:
@@ -322,18 +295,16 @@ def shared_camera(
         return None
 
     def opener() -> SharedCamera:
-        source = SharedCamera(name, stop)
-        theirs = _settings(source.offer.opened, source.camera)
-        wanted = theirs if camera is None else _settings(own, camera)
-        not_given = ("", "off") if asked else ()
-        wrong = [
-            f"{k} {theirs[k]}, not {v}" for k, v in wanted.items() if v != theirs[k] and v not in not_given
-        ]
+        source = SharedCamera(name)
+        theirs = _settings(source.camera, source.offer.opened)
+        wanted = theirs if camera is None else _settings(camera, own)
+        alike = ("", "off") if asked else ()  # options that were not given
+        wrong = [f"{k} {theirs[k]}, not {v}" for k, v in wanted.items() if v not in (theirs[k], *alike)]
         if not wrong:
             return source
         source.close()
         how = f"give the same, take it as it is (--camera {SERVICE}), or `sudo systemctl stop phalanx-slave@{name}`"
-        raise CameraError(f"slave {name!r} has the camera, with {'; '.join(wrong)}: {how}")
+        raise CameraError(f"{name!r} is the camera of a running slave, with {'; '.join(wrong)}: {how}")
 
     def lost(what: str) -> None:
         longest_s = 30.0  # a slave is back after some seconds, one that was stopped never
@@ -343,10 +314,13 @@ def shared_camera(
     if stop is None:
         return opener()
     source = ReconnectingDriver(f"slave {name}", opener, SystemClock(), stop, lost, rate_hz=rate_hz)
+    remark(f"{name}: a running slave has the camera, and gives its frames")
     return source
 
 
 def _device(driver: str) -> str:
-    """A real camera as its device; another driver as it is."""
+    """The device of a real camera; empty: it is none."""
     kind, _, place = driver.partition(":")
-    return os.path.realpath(device_path(place)) if kind == "v4l2" else f"{kind}:{place or 0}"
+    if kind == "v4l2":
+        return os.path.realpath(device_path(place))
+    return f"{kind}:{place or 0}" if kind == "picamera2" else ""

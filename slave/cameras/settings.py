@@ -96,23 +96,17 @@ def users_of(device: Path) -> str:
     by who has a device open, of which only root sees all.
     """
     paths = {path.resolve() for path in device.parent.glob(device.name)}
-    pids: set[str] = set()
-    with suppress(OSError):
-        inodes = {
-            f"{os.major(s.st_dev):02x}:{os.minor(s.st_dev):02x}:{s.st_ino}" for s in map(Path.stat, paths)
-        }
-        locks = [line.split() for line in Path("/proc/locks").read_text().splitlines()]
-        pids = {words[4] for words in locks if words[5] in inodes}
-    for process in () if pids else Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):  # it has ended, or is somebody else's
-            if any(link.resolve() in paths for link in process.glob("fd/*")):
-                pids.add(process.name)
+    locks = [line.split() for line in Path("/proc/locks").read_text().splitlines()]
+    inodes = {str(path.stat().st_ino) for path in paths}
+    pids = {words[4] for words in locks if words[5].rpartition(":")[2] in inodes}
     users: list[str] = []
-    for pid in sorted(pids - {str(os.getpid())}, key=int):
-        with suppress(OSError):
-            words = Path(f"/proc/{pid}/cmdline").read_text(errors="replace").replace("\0", " ").strip()
-            unit = Path(f"/proc/{pid}/cgroup").read_text().strip().rpartition("/")[2]
-            users.append(f"`{words[:80]}` (process {pid}{', ' + unit if unit.endswith('.service') else ''})")
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has ended, or is somebody else's
+            opened = not pids and any(link.resolve() in paths for link in process.glob("fd/*"))
+            if (opened or process.name in pids) and process.name != str(os.getpid()):
+                words = (process / "cmdline").read_text(errors="replace").replace("\0", " ").strip()
+                unit = (process / "cgroup").read_text().strip().rpartition("/")[2]
+                users.append(f"`{words[:80]}` (process {process.name} of {unit or 'no service'})")
     if users:
         return f"another program has it: {', '.join(users)}: end that"
     return f"another program may have it: `sudo fuser -v {device}` names it"

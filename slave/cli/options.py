@@ -6,17 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from common.command_line import count, megabytes, number, port, positive
-from slave.drivers import (
-    CAMERAS,
-    IMU_UNITS,
-    IMUS,
-    LIGHTS,
-    REAL_IMUS,
-    SCANS,
-    SERVICE,
-    SWITCHED_LIGHTS,
-    TRACKERS,
-)
+from slave.drivers import CAMERAS, IMU_UNITS, IMUS, LIGHTS, REAL_IMUS, SCANS, SWITCHED_LIGHTS, TRACKERS
 
 BEACON_PORT = 47800
 _START = "UDP port of the master's start (default: %(default)s)"
@@ -257,8 +247,8 @@ def record(command: ArgumentParser) -> None:
             against a quaternion in it, how right the tilt is. Without -o it is only looked at
     """
     what = command.add_mutually_exclusive_group(required=True)
-    text = "; the last one: of the running slave NAME, with its files; a camera that it has is read from it anyway"
-    what.add_argument("--camera", metavar="DRIVER", help=f"{CAMERAS} | {SERVICE}{text}")
+    text = f"{CAMERAS} | service; the last: what the running slave NAME has, with its files"
+    what.add_argument("--camera", metavar="DRIVER", help=text)
     what.add_argument(
         "--join", type=Path, nargs="+", metavar="RECORDING", help="recordings to join, one folder per camera"
     )

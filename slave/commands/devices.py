@@ -19,17 +19,15 @@ from common.calibration import CameraCalibration, ImuCalibration, RigCalibration
 from common.calibration.object_profile import ObjectProfile
 from common.calibration.strobe import StrobeCalibration
 from common.clock import Clock, SkewedClock, SystemClock
-from common.command_line import remark
 from common.errors import CalibrationError, CameraError, ImuError, LightsError, PhalanxError, TrackerError
 from common.imu.fusion import OrientationFilter
 from slave.cameras.grey import Pixels
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
-from slave.drivers import CAMERAS, IMUS, LIGHTS, REAL_IMUS, REAL_TRACKERS, SERVICE, SWITCHED_LIGHTS, TRACKERS
+from slave.drivers import CAMERAS, IMUS, LIGHTS, REAL_IMUS, REAL_TRACKERS, SWITCHED_LIGHTS, TRACKERS
 from slave.lights.interlock import Interlock
 from slave.reconnect import ReconnectingCamera, ReconnectingDriver, ReconnectingTracker
 from slave.service import LOST_PATIENCE_S, ConnectionLost, ConnectionLostFor, nobody
-from slave.shared import shared_camera
 from slave.sources import FrameSource, ImuSource, TrackerSource
 
 if TYPE_CHECKING:
@@ -194,7 +192,6 @@ class Drivers:
         clock: The slave's.
         true_clock: The machine's, or that of a scene that waits for who draws it.
         stop: Ends the waiting for a lost device; None: losing the camera is an error.
-        reader: Where a running slave may have the camera, whose frames do as well: ends the waiting for it.
     """
 
     options: argparse.Namespace
@@ -203,7 +200,6 @@ class Drivers:
     true_clock: Clock
     stop: threading.Event | None = None
     connection_lost: ConnectionLostFor = nobody
-    reader: threading.Event | None = None
 
     @classmethod
     def running(
@@ -225,11 +221,6 @@ class Drivers:
 
     def camera(self, camera: CameraCalibration) -> FrameSource:
         """Open the camera, and before it, dark, the lights of a wrist device."""
-        if self.reader is not None and str(self.options.camera).partition(":")[0] in (SERVICE, *REAL_CAMERAS):
-            shared = shared_camera(self.options, camera, self.reader)
-            if shared is not None:
-                remark(f"{self.options.name}: a running slave has the camera, and gives its frames")
-                return shared
         rig, lights = self.rig, choose_lights(self.options.lights, self.rig, str(self.options.camera))
         # a simulated board is not lit
         if lights is None or (lights == SYNTHETIC and self.options.scene == "board"):

@@ -33,7 +33,7 @@ from slave.commands.join import import_foreign, join
 from slave.commands.run import import_table_of_imu
 from slave.drivers import SERVICE
 from slave.service import stop_by_signal
-from slave.shared import SharedCamera
+from slave.shared import SharedCamera, shared_camera
 
 if TYPE_CHECKING:
     from common.recording.frame_recording import Manifest
@@ -134,7 +134,7 @@ def _record(
 
     options, stop = drivers.options, threading.Event()
     display = ProgressDisplay(options.name, sys.stderr)
-    source = replace(drivers, reader=stop).camera(camera)
+    source = shared_camera(options, camera, stop) or drivers.camera(camera)
     try:
         recorder = Recorder(
             options.output,

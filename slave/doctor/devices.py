@@ -182,18 +182,16 @@ def _automatics(path: Path) -> Finding:
     try:
         device = KernelDevice(path)
     except OSError as error:
-        return fail("automatics", f"{path}: {error.strerror}", "plug it in, or stop the program that has it")
+        return fail("camera", f"{path}: {error.strerror}", "plug it in, or stop the program that has it")
     try:
         controls = read_controls(device)
         there = [Setting(name, (off,), 0.0, "", "") for name, off in AUTOMATICS.items() if name in controls]
         on = differences(there, read_back(device, controls, there))
     except OSError as error:
-        return fail(
-            "automatics", f"{path}: cannot be asked: {error.strerror}", "unplug it and plug it in again"
-        )
+        return fail("camera", f"{path}: cannot be asked: {error.strerror}", "unplug it and plug it in again")
     finally:
         device.close()
     if on:
         fix = "restart the service; stop other programs"
-        return fail("automatics", f"on: {', '.join(on)}", fix)
-    return ok("automatics", f"{len(there)}, all off")
+        return fail("camera", f"automatics are on: {', '.join(on)}", fix)
+    return ok("camera", f"the service has it; {len(there)} automatics, all off")

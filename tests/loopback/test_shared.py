@@ -144,7 +144,7 @@ def test_a_camera_that_the_slave_has_is_recorded_and_looked_at_through_it(
     rig.edit("left", exposure_us=4000.0)
     code, output = rig.run(*fake, "record", *pi, "--frames", "20", "-o", str(tmp_path / "other"))
     assert code == 1
-    assert "slave 'left' has the camera, with exposure_us 5000.0, not 4000.0: give the same" in output
+    assert "'left' is the camera of a running slave, with exposure_us 5000.0, not 4000.0: give the same" in output
     assert not (tmp_path / "other").exists()
     # another place of the same kind is another camera
     code, output = rig.run(

@@ -97,7 +97,8 @@ def reading(slave: Slave, count: int = 1) -> list[SharedCamera]:
     """Programs that have asked for frames."""
     readers = [SharedCamera("left") for _ in range(count)]
     for reader in readers:
-        reader._end.sendall(b"+")
+        reader._file.write(b"+")
+        reader._file.flush()
         reader._asked = True
     assert until(lambda: len(slave.server._readers) == count)
     return readers
@@ -184,7 +185,7 @@ def test_frames_of_other_settings_are_never_given_in_their_place(slave: Slave, r
     other = msgspec.structs.replace(file, exposure_us=4000.0, markers=None)
     same = options("record", "--camera v4l2:/dev/video7")
     with pytest.raises(
-        CameraError, match=r"exposure_us 5000\.0, not 4000\.0: give the same, take it as it is"
+        CameraError, match=r"running slave, with exposure_us 5000\.0, not 4000\.0: give the same, take it"
     ):
         shared_camera(same, other, None)
     with pytest.raises(CameraError, match="--control , not \\['gain=32'\\]"):
@@ -242,7 +243,8 @@ def test_a_folder_that_cannot_be_made_costs_the_sharing_alone(
     slave = Slave(root / "calib_json", tmp_path)
     slave.read(frames(2))
     slave.server.close()
-    assert "its frames are not shared: AF_UNIX path too long" in caplog.text
+    assert "left: its frames are not shared: " in caplog.text
+    assert "AF_UNIX path too long" in caplog.text
 
 
 ASK = """
