@@ -30,7 +30,7 @@ from slave.markers.reloadable import (
 )
 from slave.markers.scan import Scan, ScanChoice
 from slave.preview import MarkerOverlay, Previews, WristOverlay
-from slave.raw import RawFrames, RawSettings
+from slave.raw import RawFrames, RawProbe, RawSettings
 from slave.report import DetectionCounters
 from slave.sender import MarkerPipeline, Sender, WristPipeline
 from slave.shared import FrameServer
@@ -165,6 +165,7 @@ def send_detections(
         sender.name, raw_frames, lambda: tuning.files, sender.clock, lambda: sender.uplink.started
     )
     shared = FrameServer(sender.name, opened, lambda: tuning.files.camera, lambda: raw.manifest(skewed))
+    probe = RawProbe(source, raw.offer, shared.offer)
     if isinstance(engine, WristEngine):
         line = _wrist_line(sender, files, colours, engine)
     else:
@@ -172,12 +173,12 @@ def send_detections(
     counters = line.pipeline.counters
     tuning = CameraTuning(files, source, line.prepare, lambda: counters.total > 0, line.sample)
     sender.send(
-        shared.reading(raw.reading(source)),
+        probe,
         line.pipeline,
         skips=shared.wanted,
         previews=line.previews,
         parts=(tuning, raw),
-        close=(shared.close, raw.close, lambda: workers.shutdown(cancel_futures=True)),
+        close=(probe.flush, shared.close, raw.close, lambda: workers.shutdown(cancel_futures=True)),
     )
 
 

@@ -66,14 +66,6 @@ class RawFrames(Reporting):
         self._failure: RecordingError | None = None  # why the recording of that name ended
         self._closer: threading.Thread | None = None
         self._ended = 0
-        self._probe: RawProbe | None = None
-
-    def reading(self, source: FrameSource) -> FrameSource:
-        """The camera for the loop, all of whose frames are offered."""
-        if self._settings is None:
-            return source
-        self._probe = RawProbe(source, self.offer)
-        return self._probe
 
     def offer(self, frame: Frame) -> None:
         """Take a frame while something is recorded. Never waits, never raises."""
@@ -114,9 +106,7 @@ class RawFrames(Reporting):
             self._look()
 
     def close(self) -> None:
-        """End the recording with the last frame that was read. Safe to call twice."""
-        if self._probe is not None:
-            self._probe.flush()
+        """End the recording. Safe to call twice."""
         with self._command_lock:
             self._end("the slave ends")
             self._join()
@@ -236,8 +226,8 @@ class RawFrames(Reporting):
 class RawProbe:
     """Camera that offers each frame when the loop comes back for the next one."""
 
-    def __init__(self, source: FrameSource, offer: Callable[[Frame], None]) -> None:
-        self._source, self._offer = source, offer
+    def __init__(self, source: FrameSource, *offers: Callable[[Frame], None]) -> None:
+        self._source, self._offers = source, offers
         self._last: Frame | None = None
 
     def read(self) -> Frame | None:
@@ -250,7 +240,8 @@ class RawProbe:
         """Offer the frame that the loop is at; called once the loop has ended."""
         last, self._last = self._last, None
         if last is not None:
-            self._offer(last)
+            for offer in self._offers:
+                offer(last)
 
     def close(self) -> None:
         """Give the device back."""

@@ -17,7 +17,7 @@ import socket
 import struct
 import threading
 from collections.abc import Callable, Mapping
-from contextlib import closing, suppress
+from contextlib import suppress
 from io import BufferedRWPair
 from pathlib import Path
 from socketserver import ThreadingUnixStreamServer
@@ -36,7 +36,6 @@ from common.recording.frame_recording import Illumination, Manifest
 from slave.cameras.v4l2 import device_path
 from slave.cameras.v4l2_controls import TIMEOUT_S
 from slave.drivers import SERVICE
-from slave.raw import RawProbe
 from slave.reconnect import ReconnectingDriver
 from slave.sources import Frame, FrameSource
 
@@ -129,10 +128,6 @@ class FrameServer:
                 return
             self._server.daemon_threads = True
             threading.Thread(target=self._server.serve_forever, name=f"{name} shared", daemon=True).start()
-
-    def reading(self, source: FrameSource) -> FrameSource:
-        """The camera for the loop, all of whose frames are offered."""
-        return source if self._server is None else RawProbe(source, self.offer)
 
     def offer(self, frame: Frame) -> None:
         """Queue a frame for all readers. Never waits."""
@@ -284,18 +279,12 @@ def shared_camera(
     asked, device = own["camera"] == SERVICE, _device(own["camera"])
     if not (asked or device):
         return None
-    try:
-        with closing(SharedCamera(name)) as first:
-            if not asked and device != _device(first.offer.opened["camera"]):
-                return None
-            rate_hz = first.camera.frame_rate_hz
-    except _NoSlaveError:
-        if asked:
-            raise
-        return None
 
     def opener() -> SharedCamera:
         source = SharedCamera(name)
+        if not asked and device != _device(source.offer.opened["camera"]):
+            source.close()
+            raise _NoSlaveError(f"slave {name!r} has another camera")
         theirs = _settings(source.camera, source.offer.opened)
         wanted = theirs if camera is None else _settings(camera, own)
         alike = ("", "off") if asked else ()  # options that were not given
@@ -311,9 +300,18 @@ def shared_camera(
         if source.metrics()["away_s"] > longest_s:
             raise CameraError(what)
 
+    try:
+        first = opener()
+    except _NoSlaveError:
+        if asked:
+            raise
+        return None
     if stop is None:
-        return opener()
-    source = ReconnectingDriver(f"slave {name}", opener, SystemClock(), stop, lost, rate_hz=rate_hz)
+        return first
+    made, rate_hz = [first], first.camera.frame_rate_hz
+    source = ReconnectingDriver(
+        f"slave {name}", lambda: made.pop() if made else opener(), SystemClock(), stop, lost, rate_hz=rate_hz
+    )
     remark(f"{name}: a running slave has the camera, and gives its frames")
     return source
 

@@ -75,6 +75,35 @@ def test_it_reads_its_own_keys_and_not_those_of_the_machine(host: Host) -> None:
     assert others.returncode != 0
 
 
+RECORD = "/opt/phalanx/current/bin/phalanx-slave record --camera service --name {} --frames 5 -o {} 2>&1"
+
+
+def test_frames_are_for_root_and_group_video_of_the_machine_while_it_tracks(host: Host, rig: Rig) -> None:
+    streams(rig)
+    assert host.run(f"stat -c '%a %F' /run/phalanx/{host.name}/frames") == "666 socket"
+    assert host.run(f"stat -c '%a' /run/phalanx/{host.name}") == "755"
+    restarts = host.restarts()
+    try:
+        output = host.run(RECORD.format(host.name, "/tmp/shared/root"), 60.0)
+        assert "5 frames in" in output, output
+        assert "0 dropped" in output
+        assert len(host.run("tail -n +2 /tmp/shared/root/frames.csv").splitlines()) == 5
+        host.run("chmod 777 /tmp/shared")
+        for groups, said in (
+            ("--clear-groups", "for root and group video"),
+            ("--groups video", "5 frames in"),
+        ):
+            record = RECORD.format(host.name, f"/tmp/shared/{groups.split()[-1]}")
+            output = host.try_run(f"setpriv --reuid 65534 --regid 65534 {groups} {record}", 60.0).stdout
+            assert said in output, output
+    finally:
+        host.run("rm -rf /tmp/shared")
+    streams(rig)
+    assert host.restarts() == restarts
+    host.run(f"systemctl restart {host.unit}")
+    host.run(f"test -S /run/phalanx/{host.name}/frames")
+
+
 def test_a_service_like_it_is_exposed_little(host: Host, measured: Measured) -> None:
     output = host.run(f"systemd-analyze security {host.unit} --no-pager | tail -1")
     exposure = float(output.split(":")[1].split()[0])

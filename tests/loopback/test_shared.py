@@ -75,10 +75,12 @@ def rig(tmp_path: Path) -> Generator[SharedRig, None, None]:
 
 
 def pictures(folder: Path) -> list[np.ndarray]:
-    return [
+    """The left camera's pictures as they are in their files."""
+    found = [
         cv2.imread(str(folder / row.file), cv2.IMREAD_UNCHANGED)
         for row in open_recording(folder).frames_of("left")
     ]
+    return [np.asarray(one) for one in found]
 
 
 def test_a_replayed_camera_is_recorded_to_the_last_bit_and_coloured(rig: SharedRig, tmp_path: Path) -> None:
@@ -120,7 +122,7 @@ def test_a_wrist_camera_keeps_its_light(rig: SharedRig, tmp_path: Path) -> None:
     assert code == 0, output
     rows = open_recording(tmp_path / "wave").rows
     assert {row.illumination.value for row in rows} >= {"laser", "led", "ambient"}
-    assert cv2.imread(str(tmp_path / "wave" / rows[0].file), cv2.IMREAD_UNCHANGED).ndim == 2
+    assert np.asarray(cv2.imread(str(tmp_path / "wave" / rows[0].file), cv2.IMREAD_UNCHANGED)).ndim == 2
     assert open_recording(tmp_path / "wave").manifest.kind == "wrist"
 
 
@@ -144,7 +146,10 @@ def test_a_camera_that_the_slave_has_is_recorded_and_looked_at_through_it(
     rig.edit("left", exposure_us=4000.0)
     code, output = rig.run(*fake, "record", *pi, "--frames", "20", "-o", str(tmp_path / "other"))
     assert code == 1
-    assert "'left' is the camera of a running slave, with exposure_us 5000.0, not 4000.0: give the same" in output
+    assert (
+        "'left' is the camera of a running slave, with exposure_us 5000.0, not 4000.0: give the same"
+        in output
+    )
     assert not (tmp_path / "other").exists()
     # another place of the same kind is another camera
     code, output = rig.run(

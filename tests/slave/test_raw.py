@@ -23,7 +23,7 @@ from slave.__main__ import main
 from slave.commands.join import join_recordings
 from slave.commands.offline import detect_recording
 from slave.markers.detector import Detections
-from slave.raw import RawFrames, RawSettings
+from slave.raw import RawFrames, RawProbe, RawSettings
 from slave.report import DetectionCounters, Reporter
 from slave.sender import MarkerPipeline, run
 from slave.sources import Frame
@@ -47,7 +47,7 @@ class Slave:
         paths = calibration / "cameras" / f"{name}.json", calibration / "rigs" / "desk.json"
         camera, rig = load(paths[0], CameraCalibration), load(paths[1], RigCalibration)
         self.files = CameraFiles(*paths, msgspec.structs.replace(camera, exposure_us=1234.0), rig)
-        self.free, self.here = PLENTY, True
+        self.free, self.here, self.probe = PLENTY, True, None
         settings = None if folder is None else RawSettings(folder, 1000)
         self.raw = RawFrames(
             name, settings, lambda: self.files, SystemClock(), lambda: self.here, lambda _: self.free
@@ -67,7 +67,7 @@ class Slave:
 
     def read(self, given: list[Frame]) -> None:
         """The loop, over these frames."""
-        source = self.raw.reading(ListCamera(given))
+        source = self.probe = RawProbe(ListCamera(given), self.raw.offer)
         run(
             source,
             MarkerPipeline(
@@ -130,7 +130,9 @@ def test_frames_between_the_commands_are_kept_to_the_last_bit_and_join(
             with pytest.raises(BusError, match="is being recorded: raw_stop ends it"):
                 one.begin("other")
         for one in (left, right):
-            one.raw.close()  # as at the end of the loop, whose last frame is kept, too
+            assert one.probe is not None
+            one.probe.flush()  # as at the end of the loop, whose last frame is kept, too
+            one.raw.close()
             answer = one.ask("raw_stop")
             assert (
                 answer.counts["raw.frames"],
@@ -160,7 +162,6 @@ def test_frames_between_the_commands_are_kept_to_the_last_bit_and_join(
 
 def test_it_says_why_it_does_not_begin(calibration: Path, tmp_path: Path) -> None:
     with slave(calibration, None) as left:
-        assert left.raw.reading(source := ListCamera([])) is source, "costs nothing"
         assert "raw.frames" not in left.ask("report").counts
         for verb in ("raw", "raw_stop"):
             with pytest.raises(

@@ -21,6 +21,7 @@ from common.errors import CalibrationError, CameraError
 from common.recording.frame_recording import Illumination, Manifest
 from slave.cameras.settings import users_of
 from slave.cli.table import PROGRAM
+from slave.raw import RawProbe
 from slave.shared import FrameServer, SharedCamera, opened_by, shared_camera
 from slave.sources import Frame
 from tests.network_helpers import until
@@ -48,7 +49,7 @@ class Slave:
 
     def read(self, given: list[Frame]) -> None:
         """The loop, over these frames."""
-        source = self.server.reading(ListCamera(given))
+        source = RawProbe(ListCamera(given), self.server.offer)
         while source.read() is not None:
             pass
 
@@ -128,8 +129,8 @@ def test_a_slow_reader_loses_frames_and_never_holds_up_the_loop(
     taken: list[Frame] = []
 
     def take() -> None:
-        while len(taken) < 200 and (frame := quick.read()) is not None:
-            taken.append(frame)
+        while len(taken) < 200:
+            taken.append(quick.read())
 
     thread = threading.Thread(target=take)
     thread.start()
