@@ -14,7 +14,7 @@ from pathlib import Path
 from tests.hosts.fleet import MASTER_PORT, Fleet
 
 ROOT = Path(__file__).resolve().parents[2]
-UP_S = 60.0  # for a master to start on a busy machine
+UP_S = 300.0  # for a master to start that compiles its kernels first, on a busy machine
 SCALE, RATE_HZ = 0.5, 30.0  # two cameras are rendered on the processor that also has master and deployment
 BEACON_PORT, BUS_PORT = 47800, 47802
 
@@ -150,9 +150,12 @@ class Rig:
 
 
 def copied_source(folder: Path) -> Path:
-    """The project's programs as they are now: whoever works on them meanwhile makes no other release of them."""
+    """The project's programs as they are now: whoever works on them meanwhile makes no other release of them.
+
+    What is compiled comes along, so that the master is not compiled once more.
+    """
     for package in ("common", "deploy", "master", "slave"):
-        shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / package, folder / package)
     shutil.copy(ROOT / "constraints.txt", folder)
     return folder
 
@@ -171,6 +174,12 @@ def small_calibration(source: Path, folder: Path) -> Path:
         for key in ("cx_px", "cy_px"):
             lens[key] = (lens[key] + 0.5) * SCALE - 0.5  # pixel 0 is centred at 0
         file.write_text(json.dumps(camera | {"frame_rate_hz": RATE_HZ}, indent=1))
+    file = folder / "rigs/desk.json"  # its laws of depth are of disparities [px], which have half the size, too
+    rig = json.loads(file.read_text())
+    rig["power_law"]["k_m"] *= SCALE ** -rig["power_law"]["z"]
+    for key in ("a_m_px", "x0_px"):
+        rig["affine_disparity"][key] *= SCALE
+    file.write_text(json.dumps(rig, indent=1))
     return folder
 
 
