@@ -99,7 +99,7 @@ def test_a_version_that_hangs_before_it_is_ready_is_taken_back(
     bad = changed_wheels(rig.cache, rig.folder / "hangs", "91.5", {"slave/__main__.py": HANGS})
     ran = refused(rig, "left", bad, measured, HANGS_S)
     assert "phalanx-slave@left.service is not ready after" in last_line(ran), str(ran)
-    assert "it says nothing; everything is as before" in last_line(ran), str(ran)
+    assert "it reports nothing; everything is as before" in last_line(ran), str(ran)
 
 
 def test_a_full_disk_is_reported_and_nothing_stops(
