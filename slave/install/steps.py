@@ -23,12 +23,14 @@ from slave.install.wanted import (
     CHRONY,
     ETC,
     KEYS,
+    LINK,
     OPT,
     RECORD,
     SYSUSERS,
     UNIT,
     File,
     Record,
+    has_link,
     missing_groups,
     wanted_files,
     without_block,
@@ -233,7 +235,7 @@ def uninstall(machine: Machine, dry_run: bool = False) -> list[str]:
 
 def _there(root: Path) -> list[str]:
     """What is ours, as paths below the root."""
-    own = [UNIT, SYSUSERS, CHRONY, ETC, OPT, *_STATE, *_PRIVATE]
+    own = [UNIT, SYSUSERS, CHRONY, *([LINK] if has_link(root) else []), ETC, OPT, *_STATE, *_PRIVATE]
     drop_ins = (root / "etc/systemd/system").glob("phalanx-slave@*.service.d")
     own += [str(path.relative_to(root)) for path in drop_ins]
     there = [path for path in own if (root / path).exists() or (root / path).is_symlink()]

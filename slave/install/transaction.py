@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from slave.install.arguments import InstallError
-from slave.install.wanted import OPT, File
+from slave.install.wanted import LINK, OPT, File
 
 NOTES = f"{OPT}/before"
 CURRENT = f"{OPT}/current"
@@ -126,6 +126,8 @@ def read(root: Path, path: str) -> File | None:
     own = _is_slaves(path)
     try:
         with _folder(root, path, make=False) as folder:
+            if path == LINK:
+                return File(os.readlink(Path(path).name, dir_fd=folder).encode(), stat.S_IFLNK | 0o777)
             flags = os.O_RDONLY | (os.O_NOFOLLOW | os.O_NONBLOCK if own else 0)
             with open(os.open(Path(path).name, flags, dir_fd=folder), "rb") as file:  # noqa: PTH123 - a descriptor
                 mode = os.fstat(file.fileno()).st_mode
@@ -152,17 +154,24 @@ def write(root: Path, path: str, file: File) -> None:
         try:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(fresh, dir_fd=folder)
-            with open(os.open(fresh, flags, 0o600, dir_fd=folder), "wb") as out:  # noqa: PTH123 - a descriptor
-                out.write(file.content)
-                _give_to_owner(out.fileno(), folder)
-                os.fchmod(out.fileno(), file.mode)
-                out.flush()
-                os.fsync(out.fileno())
+            if stat.S_ISLNK(file.mode):
+                os.symlink(file.content.decode(), fresh, dir_fd=folder)
+            else:
+                _write_whole(os.open(fresh, flags, 0o600, dir_fd=folder), file, folder)
             os.replace(fresh, name, src_dir_fd=folder, dst_dir_fd=folder)
         except OSError:
             with contextlib.suppress(OSError):
                 os.unlink(fresh, dir_fd=folder)
             raise
+
+
+def _write_whole(descriptor: int, file: File, folder: int) -> None:
+    with open(descriptor, "wb") as out:
+        out.write(file.content)
+        _give_to_owner(descriptor, folder)
+        os.fchmod(descriptor, file.mode)
+        out.flush()
+        os.fsync(descriptor)
 
 
 def remove(root: Path, path: str) -> None:

@@ -12,6 +12,7 @@ import os
 import pkgutil
 import re
 import ssl
+import stat
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -64,6 +65,7 @@ def _shown_to_all(text: str) -> set[str]:
 
 OPT, ETC, KEYS, CALIB = "opt/phalanx", "etc/phalanx", "etc/phalanx/keys", "var/lib/phalanx/calib_json"
 UNIT, SYSUSERS = "etc/systemd/system/phalanx-slave@.service", "etc/sysusers.d/phalanx.conf"
+LINK, COMMAND = "usr/local/bin/phalanx-slave", f"/{OPT}/current/bin/phalanx-slave"  # on everybody's PATH
 CHRONY, BOOT, RECORD = "etc/chrony/conf.d/phalanx.conf", "boot/firmware/config.txt", f"{OPT}/installed.json"
 _CHRONY = """\
 # Written by the installer of Phalanx: the clock of the master's machine first, so that cameras agree with each other.
@@ -75,7 +77,7 @@ makestep 0.1 3
 
 @dataclass(frozen=True, slots=True)
 class File:
-    """Content and mode of a file."""
+    """Content and mode of a file, or where a link leads."""
 
     content: bytes
     mode: int = 0o644
@@ -117,7 +119,12 @@ def wanted_files(plan: Plan, root: Path, record: Record) -> dict[str, File | Non
     files: dict[str, File | None] = {
         UNIT: File(_own("phalanx-slave@.service")),
         SYSUSERS: File(_own("phalanx.sysusers.conf")),
+        LINK: File(COMMAND.encode(), stat.S_IFLNK | 0o777),
     }
+    if not has_link(root) and os.path.lexists(root / LINK):
+        raise InstallError(
+            f"/{LINK}: is not of this installation; remove it (pipx uninstall?), and install again"
+        )
     for sender in plan.senders:
         files[f"{ETC}/{sender.name}.env"] = File(sender.environment.encode())
     if (root / CHRONY).parent.is_dir():
@@ -128,6 +135,11 @@ def wanted_files(plan: Plan, root: Path, record: Record) -> dict[str, File | Non
     files |= _keys(plan, root)
     files |= _gone(plan, root)
     return files | _calibration(plan, root, record)
+
+
+def has_link(root: Path) -> bool:
+    """Whether the command on the PATH is ours."""
+    return (root / LINK).is_symlink() and str((root / LINK).readlink()) == COMMAND
 
 
 def missing_groups(root: Path) -> list[str]:

@@ -111,6 +111,7 @@ class Board:
             "boot/firmware",
             "opt",
             "var/lib",
+            "usr/local/bin",
         ):
             (root / folder).mkdir(parents=True)
         (root / "etc/group").write_text("root:x:0:\nvideo:x:44:\n")

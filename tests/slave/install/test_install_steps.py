@@ -46,6 +46,43 @@ def test_a_clean_machine_gets_all_of_it(board: Board, site: Path) -> None:
     assert script.startswith(f"#!/opt/phalanx/releases/{outcome.release}/bin/python\n")
 
 
+def test_the_slave_and_it_alone_is_on_the_path_as_long_as_it_is_installed(board: Board, site: Path) -> None:
+    bin_folder = board.root / "usr/local/bin"
+    board.install(site)
+    assert [path.name for path in bin_folder.iterdir()] == ["phalanx-slave"]
+    link = bin_folder / "phalanx-slave"
+    assert str(link.readlink()) == "/opt/phalanx/current/bin/phalanx-slave"
+    link.unlink()
+    assert board.install(site).changed == ["usr/local/bin/phalanx-slave"], (
+        "an installation from before it was"
+    )
+    steps.roll_back(board.machine)
+    assert not os.path.lexists(link)
+    board.install(site)
+    assert "usr/local/bin/phalanx-slave" in uninstall(board.machine)
+    assert not list(bin_folder.iterdir())
+
+
+@pytest.mark.parametrize("leads_to", [None, "/opt/pipx/venvs/phalanx-hand/bin/phalanx-slave"])
+def test_a_foreign_command_of_that_name_is_refused_and_stays(
+    board: Board, site: Path, leads_to: str | None
+) -> None:
+    link = board.root / "usr/local/bin/phalanx-slave"
+    link.write_text("foreign") if leads_to is None else link.symlink_to(leads_to)
+    before = board.files()
+    with pytest.raises(
+        InstallError, match=r"/usr/local/bin/phalanx-slave: is not of this installation; remove"
+    ):
+        board.install(site)
+    assert board.files() == before
+    link.unlink()
+    board.install(site)
+    link.unlink()
+    link.write_text("foreign")
+    uninstall(board.machine)
+    assert link.read_text() == "foreign"
+
+
 def test_a_second_time_nothing_is_changed_or_restarted(board: Board, site: Path) -> None:
     board.install(site)
     before, pids, asked = board.files(), dict(board.systemd.pids), len(board.systemd.asked)
