@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import json
+import os
 import re
 import socket
 import sys
@@ -21,11 +22,10 @@ from deploy.deployment import (
     SshOptions,
     deploy,
     end_all,
-    line_writer,
     make_keys,
 )
 from deploy.payload import Kind, export
-from deploy.remote import DeployError, RigFile, Target, read_rig, targets_of
+from deploy.remote import DeployError, RigFile, Target, Terminal, read_rig, targets_of
 
 _EVERYWHERE = "255.255.255.255"  # of the network that --master is in
 _PREFIXED = re.compile(r"[A-Za-z0-9_.]+=")  # NAME= before a driver or before options
@@ -179,9 +179,12 @@ def deploy_slaves(options: Namespace) -> int:
     rig = read_rig(options.calibration, options.rig)
     targets = targets_of(options.hosts, rig)
     request, listening, ssh = request_of(options, rig), listen_options(options), ssh_options(options)
-    names, notify = [name for target in targets for name in target.names], line_writer(_notify)
-    with prepared_keys(options.keys, names, options.dry_run, notify) as keys:
-        return _judge(deploy(targets, replace(request, keys=keys), ssh, listening, notify))
+    names = [name for target in targets for name in target.names]
+    with (
+        Terminal(_notify, _asks()) as terminal,
+        prepared_keys(options.keys, names, options.dry_run, terminal.notify) as keys,
+    ):
+        return _judge(deploy(targets, replace(request, keys=keys), ssh, listening, terminal))
 
 
 @plainly
@@ -207,7 +210,17 @@ def wheels(options: Namespace) -> int:
 
 def _end_all(options: Namespace, act: Callable[[Host], str]) -> int:
     targets = [Target(host, ()) for host in dict.fromkeys(options.hosts)]  # whatever they serve
-    return _judge(end_all(targets, ssh_options(options), act, line_writer(_notify)))
+    with Terminal(_notify, _asks()) as terminal:
+        return _judge(end_all(targets, ssh_options(options), act, terminal))
+
+
+def _asks() -> bool:
+    """Whether there is a terminal, where a person can be asked."""
+    try:
+        os.close(os.open("/dev/tty", os.O_RDWR | os.O_NOCTTY))
+    except OSError:
+        return False
+    return True
 
 
 def _judge(results: dict[str, str | None]) -> int:

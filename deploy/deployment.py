@@ -7,6 +7,7 @@ else `WAIT_SENDERS_S`.
 """
 
 import json
+import re
 import sys
 import threading
 import time
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import cast
 
 from deploy.payload import BUNDLE, Kind, bundle, command, wheelhouse
-from deploy.remote import Deadline, DeployError, Remote, RigFile, Target, printable, run_bounded
+from deploy.remote import Deadline, DeployError, Remote, RigFile, Secret, Target, Terminal, run_bounded
 
 # from READY=1 to the first datagram is a second; each one of waiting is a second without pictures
 WAIT_SENDERS_S = 12.0
@@ -106,7 +107,7 @@ class Before:
         self._took_s = time.monotonic() - began
 
 
-STAGE = "/opt/phalanx/wheels"  # of root; the installer removes it
+STAGE = "/opt/phalanx/wheels"  # of the user who sends; the installer removes it
 _PICAMERA2 = "picamera2"  # the default of cameras
 
 
@@ -155,7 +156,8 @@ class Host:
     """One machine while it is deployed to.
 
     Attributes:
-        sudo: Whether root is reached by sudo.
+        sudo: How root is reached: sudo and its options; empty: we are root.
+        password: Sudo's, a line; empty: it asks for none.
         changed: Whether something was changed, which can be taken back.
         reboot: Whether it runs only after it was restarted.
         start_s: How long its slaves took to start before [s]; None: none runs.
@@ -165,7 +167,8 @@ class Host:
     target: Target
     remote: Remote
     notify: Callable[[str], None]
-    sudo: bool = False
+    sudo: tuple[str, ...] = ()
+    password: bytes = field(default=b"", repr=False)
     changed: bool = False
     reboot: bool = False
     start_s: float | None = None
@@ -189,7 +192,9 @@ class Host:
         if wheels.release not in cast(list[str], facts["releases"]):
             self.notify(f"{'would send' if request.dry_run else 'sending'} {wheels.size_mb:.0f} MB of wheels")
             if not request.dry_run:
-                self.remote.send(wheels.files, stage, self.sudo)
+                if self.sudo:
+                    self._root(["install", "-d", "-o", str(facts["user"]), STAGE, stage])
+                self.remote.send(wheels.files, stage)
         words = ["install", "--json", "--bundle", BUNDLE, "--master", request.master]
         words += ["--rig", request.rig.name, "--release", wheels.release, "--wheelhouse", stage]
         words += ["--ready-s", str(request.ready_s), *request.options]
@@ -205,10 +210,10 @@ class Host:
         """What it is like; DeployError: not reached, or nothing can be installed there."""
         lines: list[tuple[float, str]] = []
         code = self.remote.run(
-            command(["probe", camera, *([] if apt else ["--no-apt"])], sudo=False),
+            command(["probe", camera, *([] if apt else ["--no-apt"])]),
             bundle(),
             lambda line: lines.append((time.time(), line)),
-            60.0,
+            180.0,  # a person may be asked meanwhile
         )
         results = [(at, found) for at, line in lines if (found := _result(line)) is not None]
         if code != 0 or not results:
@@ -219,7 +224,8 @@ class Host:
         first = self.known.setdefault(str(facts["boot_id"]), self.target.host)
         if first != self.target.host:
             raise DeployError(f"is the same machine as {first}: write NAME+NAME=HOST for two cameras of one")
-        self.sudo = facts["user"] != "root"
+        if facts["user"] != "root":
+            self._become_root(str(facts["user"]), facts["root"] is True)
         self.start_s = cast("float | None", facts["start_s"])
         python = ".".join(str(part) for part in cast(list[int], facts["python"]))
         self.notify(f"{facts['model']}, {facts['os']}, {facts['machine']}, Python {python}")
@@ -254,6 +260,33 @@ class Host:
         else:
             self.notify(f"{'would install' if request.apt else 'not installed'}: {' '.join(missing)}")
 
+    def _become_root(self, user: str, without_password: bool) -> None:
+        """Find out how; DeployError: no password is taken, or sudo does not let this user."""
+        self.sudo = ("sudo", "-n", "--")
+        if without_password:
+            return
+        fix = (
+            "run it in one, or let sudo ask for none there: sudo raspi-config nonint do_sudo_pass 1 (Raspberry Pi OS), "
+            "or a NOPASSWD rule in /etc/sudoers.d"
+        )
+        prompt = f"sudo password of {user} on {self.target.host.rpartition('@')[2]}"
+        secret = Secret("password", self.target.host, prompt, fix)
+        lines: list[str] = []
+        while not self.password:
+            given = self.remote.terminal.secret(secret, self.remote.deadline).encode() + b"\n"
+            lines.clear()  # -k: it asks in any case, so that it never takes what is sent behind the password for one
+            tried = ["sh", "-c", "LC_ALL=C exec sudo -k -S -p '' true 2>&1"]
+            if self.remote.run(tried, given, lines.append, 60.0) == 0:
+                self.sudo, self.password = ("sudo", "-k", "-S", "-p", "", "--"), given
+            elif not re.search("incorrect|try again", "".join(lines)):
+                raise DeployError(f"sudo: {' '.join(lines) or 'failed'}")
+
+    def _root(self, words: Sequence[str], send: bytes = b"") -> None:
+        """Run a command as root; DeployError: it failed."""
+        lines: list[str] = []
+        if self.remote.run([*self.sudo, *words], self.password + send, lines.append) != 0:
+            raise DeployError(f"{words[0]}: {(lines or ['failed'])[-1].removeprefix('! ')}")
+
     def _act(self, words: Sequence[str], packed: bytes) -> dict[str, object]:
         """Run the installer there and return its result; DeployError: why it failed."""
         result: dict[str, object] = {}
@@ -267,7 +300,7 @@ class Host:
                 last = line
                 self.notify(line)
 
-        code = self.remote.run(command(words, self.sudo), packed, on_line)
+        code = self.remote.run([*self.sudo, *command(words)], self.password + packed, on_line)
         if "error" in result:
             raise DeployError(str(result["error"]))
         if code != 0 or not result:
@@ -313,13 +346,13 @@ def deploy(
     request: DeployRequest,
     ssh: SshOptions,
     listening: ListenOptions | None,
-    notify: Notify,
+    terminal: Terminal,
 ) -> dict[str, str | None]:
     """Deploy to all at once; host -> None, or one line why it failed there.
 
     `listening` is how first datagrams are received; None: nobody listens.
     """
-    hosts = _hosts(targets, ssh, notify)
+    hosts = _hosts(targets, ssh, terminal)
     if listening is None or request.dry_run:
         return _each(hosts, lambda host: host.deploy(request))
     before = Before([name for target in targets for name in target.names], listening)
@@ -341,7 +374,7 @@ def deploy(
 
 
 def end_all(
-    targets: Sequence[Target], ssh: SshOptions, act: Callable[[Host], str], notify: Notify
+    targets: Sequence[Target], ssh: SshOptions, act: Callable[[Host], str], terminal: Terminal
 ) -> dict[str, str | None]:
     """Roll back or remove (`act`) on all machines; host -> None, or why it failed."""
 
@@ -349,15 +382,15 @@ def end_all(
         host.look()
         host.notify(act(host))
 
-    return _each(_hosts(targets, ssh, notify), one)
+    return _each(_hosts(targets, ssh, terminal), one)
 
 
-def _hosts(targets: Sequence[Target], ssh: SshOptions, notify: Notify) -> list[Host]:
+def _hosts(targets: Sequence[Target], ssh: SshOptions, terminal: Terminal) -> list[Host]:
     known: dict[str, str] = {}
 
     def host(target: Target) -> Host:
-        remote = Remote(target.host, ssh.words, Deadline(ssh.deadline_s))
-        return Host(target, remote, lambda line: notify(f"{target.host}: {line}"), known=known)
+        remote = Remote(target.host, ssh.words, Deadline(ssh.deadline_s), terminal)
+        return Host(target, remote, lambda line: terminal.notify(f"{target.host}: {line}"), known=known)
 
     return [host(target) for target in targets]
 
@@ -373,14 +406,14 @@ def _each(hosts: Sequence[Host], act: Callable[[Host], None]) -> dict[str, str |
         return None
 
     with ThreadPoolExecutor(len(hosts)) as workers:
-        waiting = workers.map(one, hosts)
+        waiting = [workers.submit(one, host) for host in hosts]
         try:
-            results = list(waiting)
+            hosts[0].remote.terminal.serve(waiting)
         except KeyboardInterrupt:  # each ends its ssh; what runs on a machine goes on to its end there
             for host in hosts:
-                host.remote.deadline.ended.set()
+                host.remote.deadline.end()
             raise
-    return {host.target.host: result for host, result in zip(hosts, results, strict=True)}
+    return {host.target.host: one.result() for host, one in zip(hosts, waiting, strict=True)}
 
 
 def _wait_for_senders(hosts: Sequence[Host], listening: ListenOptions) -> dict[str, str | None]:
@@ -411,14 +444,3 @@ def _judge(host: Host, received: Received, listening: ListenOptions) -> None:
     except DeployError as error:
         raise DeployError(f"{why}; going back failed, too: {error}") from error
     raise DeployError(f"{why}; {back}")
-
-
-def line_writer(write: Notify) -> Notify:
-    """What writes the lines of several threads one after the other, and printable."""
-    lock = threading.Lock()
-
-    def notify(line: str) -> None:
-        with lock:
-            write(printable(line))
-
-    return notify

@@ -38,9 +38,9 @@ _BOOT = (
 BUNDLE = "@BUNDLE@"  # in arguments: where the zip is there
 
 
-def command(arguments: Sequence[str], sudo: bool) -> list[str]:
+def command(arguments: Sequence[str]) -> list[str]:
     """The command line there, which takes the zip as its input."""
-    return [*(["sudo", "-n"] if sudo else []), "python3", "-c", _BOOT, *arguments]
+    return ["python3", "-c", _BOOT, *arguments]
 
 
 def bundle(

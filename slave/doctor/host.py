@@ -194,7 +194,7 @@ def check_host(system: System) -> Iterator[Finding]:
 
 
 def _metrics(system: System) -> Iterator[Finding]:
-    folder = system.path(STATE) if system.path(STATE).is_dir() else system.root
+    folder = system.path(STATE) if os.access(system.path(STATE), os.X_OK) else system.root
     metrics = Machine(folder, system.environment).metrics()
     free_mb = metrics.get("disk_free_mb")
     if free_mb is None:

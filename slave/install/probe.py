@@ -42,7 +42,8 @@ def probe(root: Path = Path("/"), camera: str = "") -> dict[str, Any]:
         "os": release.get("PRETTY_NAME", "unknown"),
         "codename": release.get("VERSION_CODENAME", ""),
         "user": pwd.getpwuid(os.geteuid()).pw_name,
-        "root": os.geteuid() == 0 or _output_of(["sudo", "-n", "true"]) is not None,
+        "root": os.geteuid() == 0 or _output_of(["sudo", "-k", "-n", "true"]) is not None,
+        "sudo": shutil.which("sudo") is not None,
         "packages": [name for name in PACKAGES if _has_package(name)],
         "video": sorted({_text(path).strip() for path in (root / "sys/class/video4linux").glob("*/name")}),
         "cameras": _cameras() if camera.startswith("picamera2") else None,
@@ -71,11 +72,8 @@ def judge(facts: dict[str, Any], camera: str = "", apt: bool = True) -> str | No
         return "its Python cannot make virtual environments: apt install python3-venv"
     if not facts["systemd"]:
         return "systemd does not run there, which keeps the slave running: without it start `phalanx-slave run` by hand"
-    if not facts["root"]:
-        return (
-            f"user {facts['user']} may not become root without a password: log in as root, or give "
-            f"{facts['user']} passwordless sudo (Raspberry Pi OS does)"
-        )
+    if not facts["root"] and not facts["sudo"]:
+        return f"user {facts['user']} is not root, and there is no sudo: log in as root, USER@HOST"
     least_free_mb = 700.0  # wheels, what they unpack to, and the release before it
     if facts["free_mb"] < least_free_mb and not facts["releases"]:
         return f"{facts['free_mb']:.0f} MB free below /opt, needs {least_free_mb:.0f} MB"

@@ -134,7 +134,7 @@ def test_what_is_sent_has_the_keys_of_that_machine_alone_and_runs_from_memory(tm
     systemctl.chmod(0o755)
     environment = {"PATH": f"{systemctl.parent}:{os.environ['PATH']}"}
     done = subprocess.run(
-        command(words, sudo=False), input=sent, capture_output=True, cwd="/", env=environment, check=False
+        command(words), input=sent, capture_output=True, cwd="/", env=environment, check=False
     )
     result = json.loads(done.stdout.splitlines()[-1])["result"]
     assert done.returncode == 0, done.stderr.decode()
@@ -165,7 +165,7 @@ def test_a_link_that_hangs_ends_by_the_deadline_with_all_that_it_started(
     with pytest.raises(DeployError, match=r"not done within 1 s \(--deadline\)"):
         Remote("host", (), Deadline(1.0)).run(["true"], b"", print)
     with pytest.raises(DeployError, match="--deadline"):
-        Remote("host", (), Deadline(0.5)).send((tmp_path / "ssh",), "/tmp", sudo=False)
+        Remote("host", (), Deadline(0.5)).send((tmp_path / "ssh",), "/tmp")
     assert time.monotonic() - began < 60.0
     child = Path(f"/proc/{(tmp_path / 'child').read_text().strip()}/stat")
     assert not child.exists() or " Z " in child.read_text()
@@ -180,16 +180,19 @@ def test_a_link_that_hangs_ends_by_the_deadline_with_all_that_it_started(
         ),
         (
             "pi@pi: Permission denied (publickey,password).",
-            "Permission denied: your key is not known there: ssh-copy-id pi",
+            "Permission denied: neither a key nor a password of this user is taken there: ssh-copy-id pi, or USER@pi",
         ),
         (
             "ssh: connect to host pi port 22: Connection refused",
             "Connection refused: no sshd answers on pi: sudo",
         ),
-        ("Host key verification failed.", "its host key is not known here: ssh pi once"),
+        (
+            "Host key verification failed.",
+            "its host key is not known here, or was not accepted: ssh pi shows it",
+        ),
         (
             "@ WARNING: REMOTE HOST IDENTIFICATION HAS CHANGED! @\nHost key verification failed.",
-            "another machine answers than before: ssh-keygen -R pi, if",
+            "if that is meant, forget the old key: ssh-keygen -R pi",
         ),
         ("ssh: connect to host pi port 22: No route to host", "nobody has the address pi: switched on"),
         ("ssh: connect to host pi port 22: Connection timed out", "pi does not answer: switched on"),
@@ -432,7 +435,7 @@ def test_each_machine_gets_what_its_own_cameras_need(
 def test_an_interruption_ends_what_waits_for_a_machine(fake_ssh: Callable[[str], None]) -> None:
     fake_ssh("sleep 300")
     deadline = Deadline(200.0)
-    threading.Timer(0.3, deadline.ended.set).start()
+    threading.Timer(0.3, deadline.end).start()
     began = time.monotonic()
     with pytest.raises(DeployError, match="interrupted"):
         Remote("host", (), deadline).run(["true"], b"", print)

@@ -2,8 +2,7 @@
 
 import sys
 
-from deploy.deployment import line_writer
-from deploy.remote import run_bounded
+from deploy.remote import Terminal, run_bounded
 
 STEERS = "title \x1b]0;owned\x07 clear \x1b[2J c1 \x9b2J right to left \u202e tab\tend"
 
@@ -20,5 +19,5 @@ def test_lines_of_a_device_have_no_control_characters() -> None:
 
 def test_what_a_device_says_in_its_answer_is_printed_as_text_too() -> None:
     lines: list[str] = []
-    line_writer(lines.append)("left: \x1b[31mstreaming")
+    Terminal(lines.append).notify("left: \x1b[31mstreaming")
     assert lines == ["left: ?[31mstreaming"]

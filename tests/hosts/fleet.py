@@ -3,23 +3,29 @@
 import os
 import subprocess
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 
 from tests.hosts.debian import root_tree
-from tests.hosts.host import Host
+from tests.hosts.host import Account, Host
 from tests.hosts.tap import Tap
 from tests.hosts.undo import Undo
 
-USERS = {"left": "pi", "right": "root"}  # with sudo as on Raspberry Pi OS, and without
+# with sudo as on Raspberry Pi OS before April 2026, and without
+USERS = {"left": Account("pi"), "right": Account("root")}
 MASTER_PORT = 47801
 
 
 class Fleet:
     """Hosts `left` and `right`, started; holds the bridge between them and takes all of it back on leaving."""
 
-    def __init__(self) -> None:
+    def __init__(self, users: Mapping[str, Account] = USERS, number: int = os.getpid() % 250 + 1) -> None:
         """Make bridge, keys of ssh and hosts, and boot them.
+
+        Args:
+            users: Who deploys to which host.
+            number: Of the network, 1..250: runs beside one another have networks of their own.
 
         Raises:
             RuntimeError: A command failed; its own words.
@@ -30,13 +36,12 @@ class Fleet:
         self.undo.later("remove folder", str(self.folder))
         self.boot_s: dict[str, float] = {}
         try:
-            self._connect(base)
+            self._connect(base, users, number)
         except BaseException:
             self.undo.now()
             raise
 
-    def _connect(self, base: Path) -> None:
-        number = os.getpid() % 250 + 1  # runs beside one another have networks of their own
+    def _connect(self, base: Path, users: Mapping[str, Account], number: int) -> None:
         self.network, self.bridge = f"10.173.{number}", f"phx{number}"
         self.address, self.broadcast = f"{self.network}.1", f"{self.network}.255"
         self.undo.later("delete link", self.bridge)
@@ -45,13 +50,13 @@ class Fleet:
         _ip(f"link set {self.bridge} up")
         self.tap = Tap(self.bridge, MASTER_PORT)
         public_key = self._ssh_files(base)
-        self.hosts = {name: self._host(name, 11 + i, user) for i, (name, user) in enumerate(USERS.items())}
+        self.hosts = {name: self._host(name, 11 + i, user) for i, (name, user) in enumerate(users.items())}
         for host in self.hosts.values():
             host.make_disk(base, public_key)
         for host in self.hosts.values():
             self.boot_s[host.name] = host.boot()
 
-    def _host(self, name: str, number: int, user: str) -> Host:
+    def _host(self, name: str, number: int, user: Account) -> Host:
         machine = f"{self.bridge}-{name}"
         ssh = ("-F", str(self.folder / "ssh_config"))
         address = f"{self.network}.{number}"

@@ -7,7 +7,6 @@ its size is known: a disk that is full is full as a real one.
 import hashlib
 import os
 import pty
-import shlex
 import socket
 import stat
 import subprocess
@@ -30,6 +29,20 @@ LinkLocalAddressing=no
 """
 
 
+@dataclass(frozen=True)
+class Account:
+    """Who deploys to a host.
+
+    Attributes:
+        password: Empty: its key logs in, sudo asks nothing; else sudo asks for it, as Raspberry Pi OS does.
+        sshd: Lines of sshd's for this user; empty: its key logs in.
+    """
+
+    user: str
+    password: str = ""
+    sshd: str = ""
+
+
 @dataclass
 class Host:
     """A host, on or off.
@@ -38,14 +51,14 @@ class Host:
         name: Name of the host, and of the camera on it.
         address: IPv4 address on the bridge.
         folder: Where its disk, its console's log and its tree are, on this machine.
-        user: Who logs in: root, or pi with sudo, as on Raspberry Pi OS.
+        account: Who deploys. Tests look at it as root, who always has a key.
         ssh: Options of ssh before the host's name.
     """
 
     name: str
     machine: str
     address: str
-    user: str
+    account: Account
     folder: Path
     bridge: str
     ssh: tuple[str, ...]
@@ -65,7 +78,7 @@ class Host:
     @property
     def login(self) -> str:
         """USER@ADDRESS."""
-        return f"{self.user}@{self.address}"
+        return f"{self.account.user}@{self.address}"
 
     @property
     def _group(self) -> Path:
@@ -96,13 +109,29 @@ class Host:
         (wanted / "systemd-networkd.service").symlink_to("/usr/lib/systemd/system/systemd-networkd.service")
         for timer in (etc / "systemd/system/timers.target.wants").iterdir():
             timer.unlink()  # nothing of the distribution's own begins in the middle of a measurement
-        if self.user != "root":
-            _run("chroot", str(self.tree), "useradd", "--create-home", "--shell", "/bin/bash", self.user)
-            (etc / "sudoers.d/user").write_text(f"{self.user} ALL=(ALL) NOPASSWD: ALL\n")
-        home = self.tree / ("root" if self.user == "root" else f"home/{self.user}")
-        (home / ".ssh").mkdir(mode=0o700, exist_ok=True)
-        (home / ".ssh/authorized_keys").write_text(public_key)
-        _run("chroot", str(self.tree), "chown", "-R", f"{self.user}:", f"/{home.relative_to(self.tree)}")
+        user, password = self.account.user, self.account.password
+        if user != "root":
+            _run(
+                "chroot",
+                str(self.tree),
+                "useradd",
+                "--create-home",
+                "--shell",
+                "/bin/bash",
+                "-G",
+                "sudo",
+                user,
+            )
+        if user != "root" and not password:
+            (etc / "sudoers.d/user").write_text(f"{user} ALL=(ALL) NOPASSWD: ALL\n")
+        if password:
+            _run("chroot", str(self.tree), "chpasswd", given=f"{user}:{password}")
+        (etc / "ssh/sshd_config.d/user.conf").write_text(f"Match User {user}\n{self.account.sshd}\n")
+        homes = {one: self.tree / ("root" if one == "root" else f"home/{one}") for one in ("root", user)}
+        for owner, home in homes.items():
+            (home / ".ssh").mkdir(mode=0o700, exist_ok=True)
+            (home / ".ssh/authorized_keys").write_text(public_key)
+            _run("chroot", str(self.tree), "chown", "-R", f"{owner}:", f"/{home.relative_to(self.tree)}")
 
     def boot(self, timeout_s: float = 30.0) -> float:
         """Switch it on and wait for sshd; return how long that took [s].
@@ -185,8 +214,7 @@ class Host:
 
     def try_run(self, command: str, timeout_s: float = 30.0) -> subprocess.CompletedProcess[str]:
         """The same, whatever its exit code."""
-        as_root = command if self.user == "root" else f"sudo -n sh -c {shlex.quote(command)}"
-        line = ["ssh", *self.ssh, self.login, as_root]
+        line = ["ssh", *self.ssh, f"root@{self.address}", command]
         return subprocess.run(line, capture_output=True, text=True, timeout=timeout_s, check=False)
 
     @property
@@ -244,7 +272,7 @@ def _text(path: Path) -> str:
     return what
 
 
-def _run(*command: str) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+def _run(*command: str, given: str = "") -> None:
+    done = subprocess.run(command, capture_output=True, text=True, check=False, input=given)
     if done.returncode != 0:
         raise RuntimeError(f"{' '.join(command)}: {done.stderr.strip()}")

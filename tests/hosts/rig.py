@@ -174,7 +174,9 @@ def small_calibration(source: Path, folder: Path) -> Path:
         for key in ("cx_px", "cy_px"):
             lens[key] = (lens[key] + 0.5) * SCALE - 0.5  # pixel 0 is centred at 0
         file.write_text(json.dumps(camera | {"frame_rate_hz": RATE_HZ}, indent=1))
-    file = folder / "rigs/desk.json"  # its laws of depth are of disparities [px], which have half the size, too
+    file = (
+        folder / "rigs/desk.json"
+    )  # its laws of depth are of disparities [px], which have half the size, too
     rig = json.loads(file.read_text())
     rig["power_law"]["k_m"] *= SCALE ** -rig["power_law"]["z"]
     for key in ("a_m_px", "x0_px"):
