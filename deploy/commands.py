@@ -24,8 +24,8 @@ from deploy.deployment import (
     end_all,
     make_keys,
 )
-from deploy.payload import Kind, export
-from deploy.remote import DeployError, RigFile, Target, Terminal, read_rig, targets_of
+from deploy.payload import Kind, RigFile, Target, export, read_rig, targets_of
+from deploy.remote import DeployError, Terminal
 
 _EVERYWHERE = "255.255.255.255"  # of the network that --master is in
 _PREFIXED = re.compile(r"[A-Za-z0-9_.]+=")  # NAME= before a driver or before options

@@ -22,8 +22,9 @@ from pathlib import Path
 from typing import Literal, cast
 
 from deploy.deployment import make_keys
+from deploy.payload import RigFile, read_rig
 from deploy.process import Process
-from deploy.remote import DeployError, RigFile, read_rig
+from deploy.remote import DeployError
 
 SensorKind = Literal["camera", "imu", "tracker"]
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import cast
 
-from deploy.payload import BUNDLE, Kind, bundle, command, wheelhouse
-from deploy.remote import Deadline, DeployError, Remote, RigFile, Secret, Target, Terminal, run_bounded
+from deploy.payload import BUNDLE, Kind, RigFile, Target, bundle, command, wheelhouse
+from deploy.remote import Deadline, DeployError, Remote, Secret, Terminal, run_bounded
 
 # from READY=1 to the first datagram is a second; each one of waiting is a second without pictures
 WAIT_SENDERS_S = 12.0
@@ -261,7 +261,7 @@ class Host:
             self.notify(f"{'would install' if request.apt else 'not installed'}: {' '.join(missing)}")
 
     def _become_root(self, user: str, without_password: bool) -> None:
-        """Find out how; DeployError: no password is taken, or sudo does not let this user."""
+        """Find out how; DeployError: sudo does not take the password, or the user."""
         self.sudo = ("sudo", "-n", "--")
         if without_password:
             return

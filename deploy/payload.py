@@ -1,5 +1,7 @@
 """The payload is what goes to a machine: bundle, keys, files and wheels.
 
+Hosts of a command line are assigned to the cameras of a rig's file.
+
 The bundle, by the input of ssh, is installer, keys of that machine and files of the rig as one zip in memory. Nothing
 of it touches a disk there before the installer writes it: a dry run writes nothing, no key is left in a file.
 
@@ -9,6 +11,7 @@ machine, and kept below ~/.cache/phalanx.
 
 import hashlib
 import io
+import json
 import os
 import re
 import shutil
@@ -21,8 +24,103 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
+from typing import cast
 
-from deploy.remote import DeployError, RigFile
+from deploy.remote import DeployError
+
+_HOST = re.compile(r"(?:[A-Za-z0-9._-]+@)?[A-Za-z0-9.:-]+")
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A machine, and the cameras and IMUs of the rig that it serves."""
+
+    host: str
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class RigFile:
+    """A rig's file, as far as it matters here."""
+
+    name: str
+    kind: str
+    hand: str
+    cameras: tuple[str, ...]
+    imu: str | None
+    imu_placed: bool  # whether its orientations on the palm and to the world are known
+    objects: tuple[str, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All that send."""
+        return self.cameras + (() if self.imu is None else (self.imu,))
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Its files below calib_json."""
+        cameras = [f"cameras/{one}.json" for one in self.cameras]
+        objects = [f"objects/{one}.json" for one in self.objects]
+        return (f"rigs/{self.name}.json", *cameras, f"hands/{self.hand}.json", *objects)
+
+
+def read_rig(calibration: Path, name: str) -> RigFile:
+    """Read `rigs/NAME.json`.
+
+    Raises:
+        DeployError: It is missing or broken.
+    """
+    path = calibration / "rigs" / f"{name}.json"
+    try:
+        rig = cast(dict[str, object], json.loads(path.read_text()))
+        cameras = tuple(str(one) for one in cast(list[object], rig["cameras"]))
+        objects = tuple(str(one) for one in cast(list[object], rig.get("objects") or []))
+        imu = cast(dict[str, object], rig.get("imu") or {})
+        imu_name = str(imu.get("name", "imu")) if imu else None
+        placed = imu.get("q_palm_imu") is not None and imu.get("q_rig_world") is not None
+        return RigFile(name, str(rig["kind"]), str(rig["hand"]), cameras, imu_name, placed, objects)
+    except (OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
+        raise DeployError(
+            f"{path}: cannot read the rig ({error}); give --calibration DIR and --rig NAME"
+        ) from error
+
+
+def targets_of(hosts: Sequence[str], rig: RigFile) -> list[Target]:
+    """Parse `HOST` or `NAME[+NAME...]=HOST` of each host.
+
+    Hosts without a name take the rig's cameras in their order. The IMU of a rig goes to the host of its first
+    camera, unless it is named.
+
+    Raises:
+        DeployError: A name is none of the rig's, stands twice, or there are more hosts than cameras.
+    """
+    split = [host.rpartition("=") for host in hosts]
+    named = [name for names, _, _ in split for name in names.split("+") if names]
+    free = [camera for camera in rig.cameras if camera not in named]
+    targets: list[Target] = []
+    for names, _, host in split:
+        if not _HOST.fullmatch(host) or host.startswith("-"):
+            raise DeployError(f"{host!r}: not a host; write HOST, USER@HOST or NAME=HOST")
+        if not names and not free:
+            raise DeployError(
+                f"{host}: rig {rig.name!r} has no camera left for it; it has {', '.join(rig.cameras)}"
+            )
+        own = tuple(names.split("+")) if names else (free.pop(0),)
+        if rig.imu is not None and rig.imu not in named and own[0] == rig.cameras[0]:
+            own += (rig.imu,)
+        targets.append(Target(host, own))
+    given = [name for target in targets for name in target.names]
+    for name in given:
+        if name not in rig.names:
+            raise DeployError(
+                f"rig {rig.name!r} has no camera or IMU {name!r}; it has {', '.join(rig.names)}"
+            )
+        if given.count(name) > 1:
+            raise DeployError(f"{name}: stands twice; each camera has one host")
+    if len({target.host for target in targets}) < len(targets):
+        raise DeployError("a host stands twice: write NAME+NAME=HOST for two cameras of one machine")
+    return targets
+
 
 ROOT = Path(__file__).resolve().parents[1]
 KEYS, CALIBRATION = "payload/keys/", "payload/calib_json/"

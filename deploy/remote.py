@@ -1,8 +1,8 @@
 """Run commands and copy files on the hosts of a fleet.
 
-Hosts of a command line are assigned to the cameras of a rig's file. Commands go by ssh, files by rsync, and both come
-to an end, also when the network goes meanwhile. What ssh and sudo ask is asked on the terminal, once for all hosts; the
-answers are in this process and in pipes alone: in no command line, environment, file or log.
+Commands go by ssh, files by rsync, and both come to an end, also when the network goes meanwhile. What ssh and sudo
+ask is asked on the terminal, once for all hosts; the answers are in this process and in pipes alone: in no command
+line, environment, file or log.
 """
 
 import contextlib
@@ -26,104 +26,11 @@ from concurrent.futures import Future, wait
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import IO, cast
-
-_HOST = re.compile(r"(?:[A-Za-z0-9._-]+@)?[A-Za-z0-9.:-]+")
+from typing import IO
 
 
 class DeployError(Exception):
     """A demo or deployment that is not possible; one line why, and what to do."""
-
-
-@dataclass(frozen=True, slots=True)
-class Target:
-    """A machine, and the cameras and IMUs of the rig that it serves."""
-
-    host: str
-    names: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class RigFile:
-    """A rig's file, as far as it matters here."""
-
-    name: str
-    kind: str
-    hand: str
-    cameras: tuple[str, ...]
-    imu: str | None
-    imu_placed: bool  # whether its orientations on the palm and to the world are known
-    objects: tuple[str, ...]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """All that send."""
-        return self.cameras + (() if self.imu is None else (self.imu,))
-
-    @property
-    def files(self) -> tuple[str, ...]:
-        """Its files below calib_json."""
-        cameras = [f"cameras/{one}.json" for one in self.cameras]
-        objects = [f"objects/{one}.json" for one in self.objects]
-        return (f"rigs/{self.name}.json", *cameras, f"hands/{self.hand}.json", *objects)
-
-
-def read_rig(calibration: Path, name: str) -> RigFile:
-    """Read `rigs/NAME.json`.
-
-    Raises:
-        DeployError: It is missing or broken.
-    """
-    path = calibration / "rigs" / f"{name}.json"
-    try:
-        rig = cast(dict[str, object], json.loads(path.read_text()))
-        cameras = tuple(str(one) for one in cast(list[object], rig["cameras"]))
-        objects = tuple(str(one) for one in cast(list[object], rig.get("objects") or []))
-        imu = cast(dict[str, object], rig.get("imu") or {})
-        imu_name = str(imu.get("name", "imu")) if imu else None
-        placed = imu.get("q_palm_imu") is not None and imu.get("q_rig_world") is not None
-        return RigFile(name, str(rig["kind"]), str(rig["hand"]), cameras, imu_name, placed, objects)
-    except (OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
-        raise DeployError(
-            f"{path}: cannot read the rig ({error}); give --calibration DIR and --rig NAME"
-        ) from error
-
-
-def targets_of(hosts: Sequence[str], rig: RigFile) -> list[Target]:
-    """Parse `HOST` or `NAME[+NAME...]=HOST` of each host.
-
-    Hosts without a name take the rig's cameras in their order. The IMU of a rig goes to the host of its first
-    camera, unless it is named.
-
-    Raises:
-        DeployError: A name is none of the rig's, stands twice, or there are more hosts than cameras.
-    """
-    split = [host.rpartition("=") for host in hosts]
-    named = [name for names, _, _ in split for name in names.split("+") if names]
-    free = [camera for camera in rig.cameras if camera not in named]
-    targets: list[Target] = []
-    for names, _, host in split:
-        if not _HOST.fullmatch(host) or host.startswith("-"):
-            raise DeployError(f"{host!r}: not a host; write HOST, USER@HOST or NAME=HOST")
-        if not names and not free:
-            raise DeployError(
-                f"{host}: rig {rig.name!r} has no camera left for it; it has {', '.join(rig.cameras)}"
-            )
-        own = tuple(names.split("+")) if names else (free.pop(0),)
-        if rig.imu is not None and rig.imu not in named and own[0] == rig.cameras[0]:
-            own += (rig.imu,)
-        targets.append(Target(host, own))
-    given = [name for target in targets for name in target.names]
-    for name in given:
-        if name not in rig.names:
-            raise DeployError(
-                f"rig {rig.name!r} has no camera or IMU {name!r}; it has {', '.join(rig.names)}"
-            )
-        if given.count(name) > 1:
-            raise DeployError(f"{name}: stands twice; each camera has one host")
-    if len({target.host for target in targets}) < len(targets):
-        raise DeployError("a host stands twice: write NAME+NAME=HOST for two cameras of one machine")
-    return targets
 
 
 # A link that is gone shows after nine seconds. Secrets given for other hosts are tried, too: more than ssh's three.
@@ -266,7 +173,7 @@ class Terminal:
         return {"SSH_ASKPASS": helper, "SSH_ASKPASS_REQUIRE": "force", "PHALANX_HOST": host}
 
     def secret(self, secret: Secret, deadline: Deadline) -> str:
-        """The next one to try; DeployError: no person is there, or gives none that is taken."""
+        """The next one to try; DeployError: nobody is there, or none is taken."""
         return self._ask(lambda: self._next(secret), deadline)
 
     def serve(self, waiting: Sequence[Future[str | None]]) -> None:
@@ -304,7 +211,9 @@ class Terminal:
             if not self._there:
                 raise DeployError(f"{secret.prompt}: here is no terminal to ask for it; {secret.fix}")
             if len(secret.typed) == 2:
-                raise DeployError(f"{secret.prompt}: refused there, twice; is Caps Lock on, is it another user?")
+                raise DeployError(
+                    f"{secret.prompt}: refused there, twice; is Caps Lock on, is it another user?"
+                )
             for wrong in [one for one in secret.typed if one in given]:
                 given.remove(wrong)
             again = "refused; once more: " if secret.typed else ""

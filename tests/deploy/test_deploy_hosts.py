@@ -17,8 +17,18 @@ from deploy import deployment
 from deploy import payload as wheels_module
 from deploy.commands import prepared_keys
 from deploy.deployment import DeployRequest, Host, ListenOptions, Received, make_keys
-from deploy.payload import BUNDLE, bundle, command, own_wheel, wheelhouse
-from deploy.remote import Deadline, DeployError, Remote, RigFile, Target, read_rig, targets_of
+from deploy.payload import (
+    BUNDLE,
+    RigFile,
+    Target,
+    bundle,
+    command,
+    own_wheel,
+    read_rig,
+    targets_of,
+    wheelhouse,
+)
+from deploy.remote import Deadline, DeployError, Remote
 from master.cli.table import program
 from master.commands.fleet import Device, table
 from master.commands.keys import make
