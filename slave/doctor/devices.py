@@ -129,7 +129,10 @@ def check_camera(slave: argparse.Namespace, taken: bool) -> Iterator[Finding]:
         file = load(slave.calibration / "cameras" / f"{slave.name}.json", CameraCalibration)
         rig = load(slave.calibration / "rigs" / f"{slave.rig}.json", RigCalibration)
     except PhalanxError as error:
-        yield fail("camera file", str(error), "copy calib_json from the PC, or give --calibration DIR")
+        if isinstance(error.__cause__, PermissionError):
+            yield unseen("camera file", f"{slave.calibration}: only root may look: sudo phalanx-slave doctor")
+        else:
+            yield fail("camera file", str(error), "copy calib_json from the PC, or give --calibration DIR")
         return
     if slave.name not in rig.cameras:
         there = ", ".join(rig.cameras)

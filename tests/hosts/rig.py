@@ -79,7 +79,7 @@ class Rig:
             stdout=log,
             stderr=log,
             cwd=self.source,
-            env=self._environment(),
+            env=self.environment,
         )
         self.fleet.undo.later("kill process", str(self._master.pid))
         output, end = self.folder / "master.log", time.monotonic() + UP_S
@@ -110,11 +110,15 @@ class Rig:
 
     def deploy(self, *more: str, targets: tuple[str, ...] | None = None, timeout_s: float = 240.0) -> Ran:
         """Run `phalanx fleet deploy` for both hosts, or for some of them, with more options."""
+        return self.program(*self.deploy_words(*more, targets=targets), timeout_s=timeout_s)
+
+    def deploy_words(self, *more: str, targets: tuple[str, ...] | None = None) -> tuple[str, ...]:
+        """The same as words of a command line behind `python -m`."""
         where = ["--master", self.fleet.address, "--rig", "desk", "--calibration", str(self.calibration)]
         what = ["--keys", str(self.keys), "--bus", self.bus, "--camera", "synthetic", "--no-apt"]
         what += ["--beacon", f"{self.fleet.broadcast}:{BEACON_PORT}", *self.fleet.ssh_options]
         hosts = self.targets if targets is None else targets
-        return self.program("master", "fleet", "deploy", *hosts, *where, *what, *more, timeout_s=timeout_s)
+        return ("master", "fleet", "deploy", *hosts, *where, *what, *more)
 
     def rollback(self, *more: str) -> Ran:
         """Run `phalanx fleet rollback` for both hosts."""
@@ -140,12 +144,15 @@ class Rig:
             timeout=timeout_s,
             check=False,
             cwd=self.source,
-            env=self._environment(),
+            env=self.environment,
             stdin=subprocess.DEVNULL,
+            start_new_session=True,  # nobody can be asked
         )
         return Ran(ran.returncode, ran.stdout, ran.stderr, begin, time.monotonic() - begin)
 
-    def _environment(self) -> dict[str, str]:
+    @property
+    def environment(self) -> dict[str, str]:
+        """Of its programs."""
         return os.environ | {"XDG_CACHE_HOME": str(self.cache), "PYTHONPATH": str(self.source)}
 
 
