@@ -205,7 +205,7 @@ def _add_hosts(command: ArgumentParser) -> None:
 def _reach(command: ArgumentParser) -> None:
     command.add_argument("--dry-run", action="store_true", help="write nothing, print what would be done")
     text = "longest time for all machines (default: %(default)g)"
-    command.add_argument("--deadline", type=_seconds, default=900.0, metavar="S", help=text)
+    command.add_argument("--deadline", type=_seconds, default=1800.0, metavar="S", help=text)
     command.add_argument("--user", metavar="USER", help="of ssh; root, or one with sudo")
     command.add_argument("--port", type=int, metavar="PORT", help="of ssh")
     command.add_argument("--identity", type=Path, metavar="FILE", help="private key of ssh")

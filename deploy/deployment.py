@@ -228,7 +228,10 @@ class Host:
             self._become_root(str(facts["user"]), facts["root"] is True)
         self.start_s = cast("float | None", facts["start_s"])
         python = ".".join(str(part) for part in cast(list[int], facts["python"]))
-        self.notify(f"{facts['model']}, {facts['os']}, {facts['machine']}, Python {python}")
+        free = "{available_mb:.0f} of {memory_mb:.0f} MB memory, {swap_mb:.0f} MB swap, {free_mb:.0f} MB disk free"
+        self.notify(
+            f"{facts['model']}, {facts['os']}, {facts['machine']}, Python {python}; {free.format(**facts)}"
+        )
         ahead_s = cast(int, facts["t_unix_ns"]) * 1e-9 - arrived
         if abs(ahead_s) > 0.5:
             self.notify(

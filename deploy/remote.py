@@ -299,7 +299,7 @@ class Remote:
         Raises:
             DeployError: The machine is not reached, its disk is full, the link broke, or the time is over.
         """
-        words = ["rsync", "--partial", "--times", "--mkpath", "--timeout=15"]
+        words = ["rsync", "--partial", "--times", "--mkpath", "--timeout=30"]
         user, at, address = self.host.rpartition("@")
         host = f"{user}{at}[{address}]" if ":" in address else self.host  # as rsync wants an IPv6 address
         words += ["-e", shlex.join(self._ssh()), "--", *map(str, files), f"{host}:{to}/"]

@@ -38,6 +38,7 @@ def probe(root: Path = Path("/"), camera: str = "") -> dict[str, Any]:
         "venv": importlib.util.find_spec("venv") is not None,
         "systemd": (root / "run/systemd/system").is_dir(),
         "free_mb": _free_mb(root / RELEASES),
+        **_memory(root),
         "model": _text(root / "proc/device-tree/model").strip("\0\n ") or platform.node(),
         "os": release.get("PRETTY_NAME", "unknown"),
         "codename": release.get("VERSION_CODENAME", ""),
@@ -59,10 +60,10 @@ def judge(facts: dict[str, Any], camera: str = "", apt: bool = True) -> str | No
     """Why nothing can be installed there, and what to do; None: it can."""
     python = tuple(facts["python"])
     if facts["bits"] != 64 or facts["machine"] not in MACHINES:
-        return (
-            f"{facts['machine']} with {facts['bits']}-bit programs: needs a 64-bit system; "
-            "write Raspberry Pi OS (64-bit) to its card"
-        )
+        fix = "write Raspberry Pi OS (64-bit) to its card"
+        if facts["machine"] == "armv6l":
+            fix = "its processor has none; a Raspberry Pi Zero 2 W, 3, 4 or 5 has"
+        return f"{facts['os']} is a {facts['bits']}-bit system on {facts['machine']}: needs a 64-bit system; {fix}"
     if python < OLDEST:
         have = ".".join(map(str, python))
         return f"its Python is {have}, needs 3.11 or newer: Raspberry Pi OS Bookworm or Trixie has that"
@@ -77,6 +78,12 @@ def judge(facts: dict[str, Any], camera: str = "", apt: bool = True) -> str | No
     least_free_mb = 700.0  # wheels, what they unpack to, and the release before it
     if facts["free_mb"] < least_free_mb and not facts["releases"]:
         return f"{facts['free_mb']:.0f} MB free below /opt, needs {least_free_mb:.0f} MB"
+    least_memory_mb = 150.0  # a release that is loaded once takes 120 MB, pip 57 MB before
+    if (free_mb := facts["available_mb"] + facts["swap_mb"]) < least_memory_mb:
+        return (
+            f"{free_mb:.0f} MB of memory and swap free, needs {least_memory_mb:.0f} MB: Raspberry Pi OS Lite has no "
+            "desktop, which takes the most; swap is switched on by default there"
+        )
     if facts["cameras"] == []:
         return "libcamera finds no camera: look at its cable, then at `rpicam-hello --list-cameras`"
     driver, _, device = camera.partition(":")
@@ -94,6 +101,13 @@ def _free_mb(folder: Path) -> float:
     while not folder.exists():
         folder = folder.parent
     return shutil.disk_usage(folder).free * 1e-6
+
+
+def _memory(root: Path) -> dict[str, float]:
+    lines = _text(root / "proc/meminfo").splitlines()
+    kb = {line.partition(":")[0]: line.split()[1] for line in lines if len(line.split()) > 1}
+    names = {"memory_mb": "MemTotal", "available_mb": "MemAvailable", "swap_mb": "SwapFree"}
+    return {name: float(kb.get(key, 0)) * 1024e-6 for name, key in names.items()}
 
 
 def _os_release(root: Path) -> dict[str, str]:
@@ -120,7 +134,7 @@ def _output_of(command: list[str]) -> str | None:
     """Output of a command; None: it does not exist, failed, or takes too long."""
     try:
         done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=20.0, check=False
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60.0, check=False
         )
     except (OSError, subprocess.TimeoutExpired):
         return None

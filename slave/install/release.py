@@ -154,6 +154,7 @@ def _install_wheels(fresh: Path, wheels: Path) -> None:
         )
     command = [sys.executable, str(pips[-1] / "pip")] if pips else [sys.executable, "-m", "pip"]
     command += ["--python", str(fresh / "bin/python"), "install", "--no-index", "--find-links", str(wheels)]
+    command += ["--only-binary=:all:"]  # nothing is built here
     command += ["--ignore-installed", "--no-compile", "--disable-pip-version-check", "--no-input", "--quiet"]
     command += ["--root-user-action=ignore", *names]
     pip_s = 1500.0  # under emulation, too

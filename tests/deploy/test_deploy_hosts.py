@@ -290,7 +290,8 @@ def test_what_streamed_at_a_master_is_listened_for_as_long_as_it_needs(
 
 def test_one_machine_by_two_names_is_refused(fake_ssh: Callable[[str], None]) -> None:
     facts = {"why_not": None, "user": "root", "boot_id": "7", "start_s": None, "model": "m", "os": "o",
-             "machine": "aarch64", "python": [3, 13], "t_unix_ns": time.time_ns()}  # fmt: skip
+             "machine": "aarch64", "python": [3, 13], "t_unix_ns": time.time_ns(),
+             "memory_mb": 416.0, "available_mb": 300.0, "swap_mb": 0.0, "free_mb": 9000.0}  # fmt: skip
     fake_ssh(f"cat > /dev/null; echo '{json.dumps({'result': facts})}'")
     known: dict[str, str] = {}
     for name in ("pi.local", "10.0.0.5"):

@@ -26,7 +26,7 @@ from tests.programs import missing
 
 MASTER_PORT = 47801
 UP_S = 600.0  # 25 s where nothing else runs; tests are not for the load of the machine
-CORES, MEMORY_MB = 2, 1024
+CORES, MEMORY_MB = 2, 512  # as a Raspberry Pi Zero 2 W
 FASTER = (
     "mitigations=off nokaslr apparmor=0 audit=0 systemd.show_status=0 loglevel=4"  # of start under emulation
 )

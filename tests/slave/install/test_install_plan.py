@@ -28,7 +28,11 @@ FACTS = {
     "root": False,
     "sudo": True,
     "user": "pi",
+    "os": "Raspbian GNU/Linux 13 (trixie)",
     "free_mb": 9000.0,
+    "memory_mb": 416.0,
+    "available_mb": 300.0,
+    "swap_mb": 416.0,
     "releases": [],
     "cameras": ["imx708"],
     "video": ["unicam"],
@@ -193,8 +197,26 @@ def test_what_config_txt_says_already_is_not_said_again() -> None:
 @pytest.mark.parametrize(
     ("facts", "camera", "output"),
     [
-        ({"bits": 32}, "", "needs a 64-bit system"),
-        ({"machine": "armv7l"}, "", "needs a 64-bit system"),
+        (
+            {"bits": 32},
+            "",
+            "Raspbian GNU/Linux 13 (trixie) is a 32-bit system on aarch64: needs a 64-bit system; write",
+        ),
+        (
+            {"machine": "armv7l", "bits": 32},
+            "",
+            "needs a 64-bit system; write Raspberry Pi OS (64-bit) to its card",
+        ),
+        (
+            {"machine": "armv6l", "bits": 32},
+            "",
+            "its processor has none; a Raspberry Pi Zero 2 W, 3, 4 or 5 has",
+        ),
+        (
+            {"available_mb": 90.0, "swap_mb": 0.0},
+            "",
+            "90 MB of memory and swap free, needs 150 MB: Raspberry Pi OS Lite",
+        ),
         ({"python": [3, 9]}, "", "its Python is 3.9, needs 3.11 or newer"),
         ({"python": [3, 15]}, "", "needs 3.11 to 3.14"),
         ({"venv": False}, "", "apt install python3-venv"),
@@ -224,6 +246,7 @@ def test_this_machine_is_described() -> None:
     assert set(facts) >= set(FACTS)
     assert facts["bits"] == 64
     assert facts["free_mb"] > 0
+    assert facts["memory_mb"] > facts["available_mb"] > 100
 
 
 def test_a_service_that_restarts_or_says_nothing_is_not_ready() -> None:
