@@ -25,7 +25,7 @@ from deploy.deployment import (
     make_keys,
 )
 from deploy.payload import Kind, RigFile, Target, export, read_rig, targets_of
-from deploy.remote import DeployError, Terminal
+from deploy.remote import DeployError, Terminal, printable
 
 _EVERYWHERE = "255.255.255.255"  # of the network that --master is in
 _PREFIXED = re.compile(r"[A-Za-z0-9_.]+=")  # NAME= before a driver or before options
@@ -181,7 +181,7 @@ def deploy_slaves(options: Namespace) -> int:
     request, listening, ssh = request_of(options, rig), listen_options(options), ssh_options(options)
     names = [name for target in targets for name in target.names]
     with (
-        Terminal(_notify, _asks()) as terminal,
+        Terminal(_notify, _asks()).listening() as terminal,
         prepared_keys(options.keys, names, options.dry_run, terminal.notify) as keys,
     ):
         return _judge(deploy(targets, replace(request, keys=keys), ssh, listening, terminal))
@@ -210,7 +210,7 @@ def wheels(options: Namespace) -> int:
 
 def _end_all(options: Namespace, act: Callable[[Host], str]) -> int:
     targets = [Target(host, ()) for host in dict.fromkeys(options.hosts)]  # whatever they serve
-    with Terminal(_notify, _asks()) as terminal:
+    with Terminal(_notify, _asks()).listening() as terminal:
         return _judge(end_all(targets, ssh_options(options), act, terminal))
 
 
@@ -227,7 +227,7 @@ def _judge(results: dict[str, str | None]) -> int:
     """Notify which machines failed; the exit code."""
     failed = {host: why for host, why in results.items() if why is not None}
     for host, why in failed.items():
-        sys.stderr.write(f"{host}: FAILED: {why}\n")
+        sys.stderr.write(f"{host}: FAILED: {printable(why)}\n")
     return 1 if failed else 0
 
 

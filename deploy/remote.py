@@ -13,7 +13,6 @@ import os
 import queue
 import re
 import shlex
-import shutil
 import signal
 import socket
 import subprocess
@@ -21,11 +20,10 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import IO
 
 
@@ -140,26 +138,24 @@ class Terminal:
         self._secrets: dict[tuple[str, int, str], Secret] = {}
         self._deadlines: dict[str, Deadline] = {}
 
-    def __enter__(self) -> "Terminal":
-        """Listen for what ssh asks, on a socket of this user alone."""
-        self._folder = tempfile.mkdtemp(prefix="phalanx-")
-        self._socket = socket.socket(socket.AF_UNIX)
-        self._socket.bind(f"{self._folder}/ask")
-        self._socket.listen()
-        words = {"python": shlex.quote(sys.executable), "socket": shlex.quote(f"{self._folder}/ask")}
-        (helper := Path(self._folder, "askpass")).write_text(_HELPER.format(**words))
-        helper.chmod(0o700)
-        threading.Thread(target=self._listen, daemon=True).start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Nobody is asked any more."""
-        with contextlib.suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)
-        self._socket.close()
-        shutil.rmtree(self._folder, ignore_errors=True)
+    @contextlib.contextmanager
+    def listening(self) -> Generator["Terminal"]:
+        """Answer what ssh asks, on a socket of this user alone."""
+        with (
+            tempfile.TemporaryDirectory(prefix="phalanx-") as self._folder,
+            socket.socket(socket.AF_UNIX) as asks,
+        ):
+            asks.bind(f"{self._folder}/ask")
+            asks.listen()
+            words = {"python": shlex.quote(sys.executable), "socket": shlex.quote(f"{self._folder}/ask")}
+            (helper := Path(self._folder, "askpass")).write_text(_HELPER.format(**words))
+            helper.chmod(0o700)
+            threading.Thread(target=self._listen, args=(asks,), daemon=True).start()
+            try:
+                yield self
+            finally:
+                with contextlib.suppress(OSError):
+                    asks.shutdown(socket.SHUT_RDWR)
 
     def notify(self, line: str) -> None:
         """Write a line, printable, when no question is open."""
@@ -211,25 +207,23 @@ class Terminal:
             if not self._there:
                 raise DeployError(f"{secret.prompt}: here is no terminal to ask for it; {secret.fix}")
             if len(secret.typed) == 2:
-                raise DeployError(
-                    f"{secret.prompt}: refused there, twice; is Caps Lock on, is it another user?"
-                )
+                raise DeployError(f"{secret.prompt}: refused there, twice; is it another user?")
             for wrong in [one for one in secret.typed if one in given]:
                 given.remove(wrong)
             again = "refused; once more: " if secret.typed else ""
             others = " (tried on the others, too)" if self._several and secret.kind else ""
             with self._lock:
-                answer = getpass.getpass(f"{again}{secret.prompt}{others}: ")
+                answer = getpass.getpass(printable(f"{again}{secret.prompt}{others}: "))
             secret.typed.append(answer)
             given.append(answer)
         secret.answers.append(answer)
         self._last[place] = answer
         return answer
 
-    def _listen(self) -> None:
+    def _listen(self, asks: socket.socket) -> None:
         with contextlib.suppress(OSError):  # closed
             while True:
-                peer = self._socket.accept()[0]
+                peer = asks.accept()[0]
                 with peer, contextlib.suppress(OSError, ValueError, KeyError):  # not our helper
                     ssh, prompt, host, *hint = json.loads(peer.makefile().readline())
                     peer.sendall(self._answer(host, ssh, prompt.strip(), "none" in hint).encode())
@@ -245,9 +239,8 @@ class Terminal:
                 return self._ask(lambda: self._confirm(host, prompt), deadline)
             kind = next((one for one in ("passphrase", "password") if one in prompt.lower()), "")
             kind = about if kind == "passphrase" else kind  # of that key, on all machines
-            secret = Secret(
-                kind, host, about, f"ssh-copy-id {host} puts your key there, ssh-agent holds it here"
-            )
+            fix = f"ssh-copy-id {host} puts your key there, ssh-agent holds it here"
+            secret = Secret(kind, host, about, fix)
             return self.secret(self._secrets.setdefault((host, ssh, prompt), secret), deadline)
         except DeployError as error:
             deadline.end(str(error))

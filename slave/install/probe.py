@@ -49,7 +49,6 @@ def probe(root: Path = Path("/"), camera: str = "") -> dict[str, Any]:
         "video": sorted({_text(path).strip() for path in (root / "sys/class/video4linux").glob("*/name")}),
         "cameras": _cameras() if camera.startswith("picamera2") else None,
         "releases": sorted(path.name for path in (root / RELEASES / "releases").glob("[!.]*")),
-        "hostname": platform.node(),
         "boot_id": _text(root / "proc/sys/kernel/random/boot_id").strip(),
     }
     found["t_unix_ns"] = time.time_ns()  # last: the asker compares it with the moment at which it arrives

@@ -109,9 +109,7 @@ def test_a_wrong_password_has_one_more_try_and_the_machine_is_named(
     asked = typed("secret-1", "secret-2")
     assert uninstall("pi@left") == 1
     printed = capsys.readouterr()
-    assert printed.err.startswith(
-        "pi@left: FAILED: sudo password of pi on left: refused there, twice; is Caps"
-    )
+    assert printed.err.startswith("pi@left: FAILED: sudo password of pi on left: refused there, twice; is it")
     assert "secret" not in printed.out + printed.err
 
 
@@ -203,7 +201,7 @@ def test_a_code_that_holds_once_is_asked_for_each_time(monkeypatch: pytest.Monke
 
 def test_what_only_has_to_be_looked_at_is_shown_and_answered_by_nobody(tmp_path: Path) -> None:
     output: list[str] = []
-    with Terminal(output.append) as terminal:
+    with Terminal(output.append).listening() as terminal:
         (tmp_path / "ssh").write_text(
             '#!/bin/sh\nSSH_ASKPASS_PROMPT=none "$SSH_ASKPASS" "Touch \x1b[2Jyour key"\n'
         )
@@ -215,7 +213,7 @@ def test_what_only_has_to_be_looked_at_is_shown_and_answered_by_nobody(tmp_path:
 
 
 def test_the_socket_is_of_this_user_alone_and_goes(tmp_path: Path) -> None:
-    with Terminal() as terminal:
+    with Terminal().listening() as terminal:
         folder = Path(terminal.environment("left", Deadline(1.0))["SSH_ASKPASS"]).parent
         assert folder.stat().st_mode & 0o777 == 0o700
     assert not folder.exists()
@@ -232,7 +230,7 @@ def test_an_unknown_host_key_is_refused_with_its_fingerprint_where_nobody_is_ask
     (tmp_path / "ssh").write_text(f'#!/bin/sh\n"$SSH_ASKPASS" "$(cat {tmp_path}/question)"; sleep 60\n')
     (tmp_path / "ssh").chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    with Terminal() as terminal, ThreadPoolExecutor(1) as pool:
+    with Terminal().listening() as terminal, ThreadPoolExecutor(1) as pool:
         login = pool.submit(_login, Remote("pi@left", (), Deadline(60.0), terminal))
         terminal.serve([login])
     with pytest.raises(DeployError) as refused:
