@@ -228,7 +228,7 @@ class Host:
             self._become_root(str(facts["user"]), facts["root"] is True)
         self.start_s = cast("float | None", facts["start_s"])
         python = ".".join(str(part) for part in cast(list[int], facts["python"]))
-        free = "{available_mb:.0f} of {memory_mb:.0f} MB memory, {swap_mb:.0f} MB swap, {free_mb:.0f} MB disk free"
+        free = "free: {available_mb:.0f} of {memory_mb:.0f} MB memory, {swap_mb:.0f} MB swap, {free_mb:.0f} MB disk"
         self.notify(
             f"{facts['model']}, {facts['os']}, {facts['machine']}, Python {python}; {free.format(**facts)}"
         )

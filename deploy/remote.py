@@ -213,7 +213,11 @@ class Terminal:
             again = "refused; once more: " if secret.typed else ""
             others = " (tried on the others, too)" if self._several and secret.kind else ""
             with self._lock:
-                answer = getpass.getpass(printable(f"{again}{secret.prompt}{others}: "))
+                try:
+                    answer = getpass.getpass(printable(f"{again}{secret.prompt}{others}: "))
+                except (EOFError, KeyboardInterrupt):
+                    self._write("")  # behind the question
+                    raise
             secret.typed.append(answer)
             given.append(answer)
         secret.answers.append(answer)
