@@ -1,4 +1,4 @@
-"""Debian 13 as a folder, made once by mmdebstrap: systemd, sshd, Python and rsync as Raspberry Pi OS has them."""
+"""Debian as a folder, made once by mmdebstrap: systemd, sshd, Python and rsync as Raspberry Pi OS has them."""
 
 import os
 import platform
@@ -8,7 +8,8 @@ from pathlib import Path
 from tests.cached import key_of, made_once
 from tests.programs import missing
 
-SUITE, MIRROR = "trixie", "http://deb.debian.org/debian"
+TRIXIE, BOOKWORM = "trixie", "bookworm"  # with Python 3.13 and 3.11
+MIRROR = "http://deb.debian.org/debian"
 PACKAGES = (
     *("systemd", "systemd-sysv", "dbus", "iproute2", "procps", "sudo"),
     *("openssh-server", "rsync", "chrony", "python3", "python3-venv", "libgomp1"),
@@ -36,7 +37,7 @@ def control_groups() -> Path | None:
     return None
 
 
-def root_tree() -> Path:
+def root_tree(suite: str = TRIXIE) -> Path:
     """Folder with a Debian that nothing was changed in; made if it is not there (half a minute, 75 MB to load).
 
     It is below PHALANX_CACHE, by default ~/.cache/phalanx.
@@ -45,8 +46,8 @@ def root_tree() -> Path:
         RuntimeError: mmdebstrap failed; its own words.
     """
     architecture = ARCHITECTURES[platform.machine()]
-    recipe = key_of(f"{SUITE} {PACKAGES} {MIRROR}")
-    return made_once(cache() / f"{SUITE}-{architecture}-{recipe}", lambda folder: _make(architecture, folder))
+    place = cache() / f"{suite}-{architecture}-{key_of(f'{suite} {PACKAGES} {MIRROR}')}"
+    return made_once(place, lambda folder: _make(suite, architecture, folder))
 
 
 def cache() -> Path:
@@ -55,9 +56,9 @@ def cache() -> Path:
     return Path(os.environ.get("PHALANX_CACHE", typical)) / "hosts"
 
 
-def _make(architecture: str, folder: Path) -> None:
+def _make(suite: str, architecture: str, folder: Path) -> None:
     command = ["mmdebstrap", "--quiet", "--variant=minbase", f"--arch={architecture}", "--format=directory"]
-    what = [f"--include={','.join(PACKAGES)}", "--skip=check/empty", SUITE, str(folder), MIRROR]
+    what = [f"--include={','.join(PACKAGES)}", "--skip=check/empty", suite, str(folder), MIRROR]
     made = subprocess.run([*command, *what], capture_output=True, text=True, check=False)
     if made.returncode != 0:
         raise RuntimeError(f"mmdebstrap failed:\n{made.stderr[-2000:]}")

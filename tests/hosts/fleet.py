@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 
-from tests.hosts.debian import root_tree
 from tests.hosts.host import Account, Host
 from tests.hosts.tap import Tap
 from tests.hosts.undo import Undo
@@ -30,18 +29,17 @@ class Fleet:
         Raises:
             RuntimeError: A command failed; its own words.
         """
-        base = root_tree()
         self.undo = Undo()
         self.folder = Path(tempfile.mkdtemp(prefix="phalanx-hosts-"))
         self.undo.later("remove folder", str(self.folder))
         self.boot_s: dict[str, float] = {}
         try:
-            self._connect(base, users, number)
+            self._connect(users, number)
         except BaseException:
             self.undo.now()
             raise
 
-    def _connect(self, base: Path, users: Mapping[str, Account], number: int) -> None:
+    def _connect(self, users: Mapping[str, Account], number: int) -> None:
         self.network, self.bridge = f"10.173.{number}", f"phx{number}"
         self.address, self.broadcast = f"{self.network}.1", f"{self.network}.255"
         self.undo.later("delete link", self.bridge)
@@ -49,10 +47,10 @@ class Fleet:
         _ip(f"addr add {self.address}/24 broadcast {self.broadcast} dev {self.bridge}")
         _ip(f"link set {self.bridge} up")
         self.tap = Tap(self.bridge, MASTER_PORT)
-        public_key = self._ssh_files(base)
         self.hosts = {name: self._host(name, 11 + i, user) for i, (name, user) in enumerate(users.items())}
+        public_key = self._ssh_files()
         for host in self.hosts.values():
-            host.make_disk(base, public_key)
+            host.make_disk(public_key)
         for host in self.hosts.values():
             self.boot_s[host.name] = host.boot()
 
@@ -62,12 +60,13 @@ class Fleet:
         address = f"{self.network}.{number}"
         return Host(name, machine, address, user, self.folder / name, self.bridge, ssh, self.undo)
 
-    def _ssh_files(self, base: Path) -> str:
+    def _ssh_files(self) -> str:
         """Keys for this run, and what the hosts' own are: ssh asks nothing and trusts nobody else."""
         key = self.folder / "id"
         subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(key)], check=True)
-        of_hosts = (base / "etc/ssh/ssh_host_ed25519_key.pub").read_text()
-        (self.folder / "known_hosts").write_text(f"{self.network}.* {of_hosts}")
+        keys = {one.address: one.base / "etc/ssh/ssh_host_ed25519_key.pub" for one in self.hosts.values()}
+        known = "".join(f"{address} {file.read_text()}" for address, file in keys.items())
+        (self.folder / "known_hosts").write_text(known)
         (self.folder / "ssh_config").write_text(
             f"IdentityFile {key}\nIdentitiesOnly yes\nUserKnownHostsFile {self.folder}/known_hosts\n"
             "StrictHostKeyChecking yes\nBatchMode yes\nConnectTimeout 5\nLogLevel ERROR\n"

@@ -15,7 +15,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.hosts.debian import control_groups
+from tests.hosts.debian import TRIXIE, control_groups, root_tree
 from tests.hosts.undo import Undo, kill_group
 
 DISK_MB = 1500
@@ -36,11 +36,13 @@ class Account:
     Attributes:
         password: Empty: its key logs in, sudo asks nothing; else sudo asks for it, as Raspberry Pi OS does.
         sshd: Lines of sshd's for this user; empty: its key logs in.
+        suite: Debian of the host.
     """
 
     user: str
     password: str = ""
     sshd: str = ""
+    suite: str = TRIXIE
 
 
 @dataclass
@@ -86,7 +88,12 @@ class Host:
         assert groups is not None
         return groups / self.machine
 
-    def make_disk(self, base: Path, public_key: str) -> None:
+    @property
+    def base(self) -> Path:
+        """The shared tree that its disk is laid over."""
+        return root_tree(self.account.suite)
+
+    def make_disk(self, public_key: str) -> None:
         """Lay an empty disk over `base`, and give it name, address and who may log in."""
         disk = self.folder / "disk"
         for place in (disk, self.tree):
@@ -96,7 +103,7 @@ class Host:
         for part in ("upper", "work"):
             (disk / part).mkdir()
         (disk / "upper").chmod(0o755)
-        layers = f"lowerdir={base},upperdir={disk}/upper,workdir={disk}/work"
+        layers = f"lowerdir={self.base},upperdir={disk}/upper,workdir={disk}/work"
         _run("mount", "-t", "overlay", "phalanx-host", "-o", layers, str(self.tree))
         self._settle(public_key)
 
@@ -111,17 +118,8 @@ class Host:
             timer.unlink()  # nothing of the distribution's own begins in the middle of a measurement
         user, password = self.account.user, self.account.password
         if user != "root":
-            _run(
-                "chroot",
-                str(self.tree),
-                "useradd",
-                "--create-home",
-                "--shell",
-                "/bin/bash",
-                "-G",
-                "sudo",
-                user,
-            )
+            who = ("--create-home", "--shell", "/bin/bash", "-G", "sudo", user)
+            _run("chroot", str(self.tree), "useradd", *who)
         if user != "root" and not password:
             (etc / "sudoers.d/user").write_text(f"{user} ALL=(ALL) NOPASSWD: ALL\n")
         if password:
@@ -131,6 +129,7 @@ class Host:
         for owner, home in homes.items():
             (home / ".ssh").mkdir(mode=0o700, exist_ok=True)
             (home / ".ssh/authorized_keys").write_text(public_key)
+            (home / ".sudo_as_admin_successful").touch()  # sudo's own, of its first use
             _run("chroot", str(self.tree), "chown", "-R", f"{owner}:", f"/{home.relative_to(self.tree)}")
 
     def boot(self, timeout_s: float = 30.0) -> float:

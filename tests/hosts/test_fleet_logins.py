@@ -4,6 +4,7 @@ Each host has a password of its own, which no process, journal or file may show.
 """
 
 import os
+import platform
 import shlex
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.hosts.debian import why_not
+from tests.hosts.debian import BOOKWORM, why_not
 from tests.hosts.fleet import Fleet
 from tests.hosts.host import Account, Host
 from tests.hosts.measured import Measured
@@ -28,10 +29,10 @@ PASSWORD = "PubkeyAuthentication no\nPasswordAuthentication yes\nAuthenticationM
 
 @pytest.fixture(scope="module")
 def fleet() -> Iterator[Fleet]:
-    """Two hosts of users that are not `pi`."""
+    """Two hosts of users that are not `pi`, of the two systems there are."""
     if (reason := why_not()) is not None:
         pytest.skip(reason)
-    users = {"left": Account("maker", BY_KEY), "right": Account("ana", BY_PASSWORD, KEYBOARD)}
+    users = {"left": Account("maker", BY_KEY), "right": Account("ana", BY_PASSWORD, KEYBOARD, BOOKWORM)}
     with Fleet(users, (os.getpid() + 1) % 250 + 1) as hosts:
         yield hosts
 
@@ -139,6 +140,8 @@ def test_two_hosts_with_different_passwords_are_asked_for_once_each_and_nobody_s
     assert ran.code == 0, str(ran)
     measured("deploy to two hosts that ask, at a terminal", ran.seconds)
     assert ran.out.count("assword") == 2, str(ran)
+    assert f"Debian GNU/Linux 13 (trixie), {platform.machine()}, Python 3.13; free: " in ran.out
+    assert f"Debian GNU/Linux 12 (bookworm), {platform.machine()}, Python 3.11; free: " in ran.out
     assert reader.rounds > 100
     assert reader.found == set()
     assert_nowhere(rig, ran)
