@@ -192,8 +192,10 @@ class Host:
         if wheels.release not in cast(list[str], facts["releases"]):
             self.notify(f"{'would send' if request.dry_run else 'sending'} {wheels.size_mb:.0f} MB of wheels")
             if not request.dry_run:
-                if self.sudo:
-                    self._root(["install", "-d", "-o", str(facts["user"]), STAGE, stage])
+                if self.sudo:  # a folder of the user's, so that rsync needs no root
+                    made = [*self.sudo, "install", "-d", "-o", str(facts["user"]), STAGE, stage]
+                    if self.remote.run(made, self.password, self.notify) != 0:
+                        raise DeployError(f"cannot make {stage}")
                 self.remote.send(wheels.files, stage)
         words = ["install", "--json", "--bundle", BUNDLE, "--master", request.master]
         words += ["--rig", request.rig.name, "--release", wheels.release, "--wheelhouse", stage]
@@ -282,13 +284,7 @@ class Host:
             if self.remote.run(tried, given, lines.append, 60.0) == 0:
                 self.sudo, self.password = ("sudo", "-k", "-S", "-p", "", "--"), given
             elif not re.search("incorrect|try again", "".join(lines)):
-                raise DeployError(f"sudo: {' '.join(lines) or 'failed'}")
-
-    def _root(self, words: Sequence[str], send: bytes = b"") -> None:
-        """Run a command as root; DeployError: it failed."""
-        lines: list[str] = []
-        if self.remote.run([*self.sudo, *words], self.password + send, lines.append) != 0:
-            raise DeployError(f"{words[0]}: {(lines or ['failed'])[-1].removeprefix('! ')}")
+                raise DeployError(f"sudo: {' '.join(lines[-2:]) or 'failed'}")
 
     def _act(self, words: Sequence[str], packed: bytes) -> dict[str, object]:
         """Run the installer there and return its result; DeployError: why it failed."""

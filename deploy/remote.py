@@ -32,35 +32,16 @@ class DeployError(Exception):
 
 
 # A link that is gone shows after nine seconds. Secrets given for other hosts are tried, too: more than ssh's three.
-_SETTINGS = (
-    "ConnectTimeout=10",
-    "ServerAliveInterval=3",
-    "ServerAliveCountMax=3",
-    "NumberOfPasswordPrompts=6",
-)
-_HINTS = (  # the first that is found: a changed host key is reported with two of them
-    (
-        "Could not resolve hostname",
-        "no machine of that name is known here; switched on, in this network? Or give its address in place of HOST",
-    ),
+_PROMPTS = "NumberOfPasswordPrompts=6"
+_SETTINGS = ("ConnectTimeout=10", "ServerAliveInterval=3", "ServerAliveCountMax=3", _PROMPTS)
+_HINTS = (  # the first that is found
+    ("Could not resolve hostname", "HOST is not known here: is it on, in this network? Or give its address"),
     ("Connection refused", "no sshd answers on HOST: sudo systemctl enable --now ssh there, or give --port"),
-    (
-        "No route to host",
-        "nobody has the address HOST: switched on, in this network, is its address another now?",
-    ),
+    ("No route to host", "nobody has the address HOST: is it on, in this network, is its address new?"),
     ("Network is unreachable", "this machine has no way to HOST: is its own network up?"),
-    (
-        "Connection timed out",
-        "HOST does not answer: switched on, in this network? A firewall that drops port 22?",
-    ),
-    (
-        "Permission denied",
-        "neither a key nor a password of this user is taken there: ssh-copy-id HOST, or USER@HOST for another user",
-    ),
-    (
-        "Host key verification failed",
-        "its host key is not known here, or was not accepted: ssh HOST shows it",
-    ),
+    ("Connection timed out", "HOST does not answer: is it on, in this network? A firewall at port 22?"),
+    ("Permission denied", "no key or password is taken: ssh-copy-id HOST, or another user by USER@HOST"),
+    ("Host key verification failed", "it is not known here, or was not accepted: ssh HOST shows it"),
 )
 
 

@@ -80,8 +80,8 @@ def judge(facts: dict[str, Any], camera: str = "", apt: bool = True) -> str | No
     least_memory_mb = 150.0  # a release that is loaded once takes 120 MB, pip 57 MB before
     if (free_mb := facts["available_mb"] + facts["swap_mb"]) < least_memory_mb:
         return (
-            f"{free_mb:.0f} MB of memory and swap free, needs {least_memory_mb:.0f} MB: Raspberry Pi OS Lite has no "
-            "desktop, which takes the most; swap is switched on by default there"
+            f"{free_mb:.0f} MB of memory and swap free, needs {least_memory_mb:.0f} MB: switch swap on, or write "
+            "Raspberry Pi OS Lite to its card, which has no desktop"
         )
     if facts["cameras"] == []:
         return "libcamera finds no camera: look at its cable, then at `rpicam-hello --list-cameras`"

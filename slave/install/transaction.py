@@ -157,21 +157,17 @@ def write(root: Path, path: str, file: File) -> None:
             if stat.S_ISLNK(file.mode):
                 os.symlink(file.content.decode(), fresh, dir_fd=folder)
             else:
-                _write_whole(os.open(fresh, flags, 0o600, dir_fd=folder), file, folder)
+                with open(os.open(fresh, flags, 0o600, dir_fd=folder), "wb") as out:  # noqa: PTH123 - a descriptor
+                    out.write(file.content)
+                    _give_to_owner(out.fileno(), folder)
+                    os.fchmod(out.fileno(), file.mode)
+                    out.flush()
+                    os.fsync(out.fileno())
             os.replace(fresh, name, src_dir_fd=folder, dst_dir_fd=folder)
         except OSError:
             with contextlib.suppress(OSError):
                 os.unlink(fresh, dir_fd=folder)
             raise
-
-
-def _write_whole(descriptor: int, file: File, folder: int) -> None:
-    with open(descriptor, "wb") as out:
-        out.write(file.content)
-        _give_to_owner(descriptor, folder)
-        os.fchmod(descriptor, file.mode)
-        out.flush()
-        os.fsync(descriptor)
 
 
 def remove(root: Path, path: str) -> None:

@@ -186,11 +186,11 @@ def test_a_link_that_hangs_ends_by_the_deadline_with_all_that_it_started(
     [
         (
             "ssh: Could not resolve hostname pi: Name or service not known",
-            "Could not resolve hostname: no machine of that name is known here; switched on, in this network? Or give",
+            "Could not resolve hostname: pi is not known here: is it on, in this network? Or give its address",
         ),
         (
             "pi@pi: Permission denied (publickey,password).",
-            "Permission denied: neither a key nor a password of this user is taken there: ssh-copy-id pi, or USER@pi",
+            "Permission denied: no key or password is taken: ssh-copy-id pi, or another user by USER@pi",
         ),
         (
             "ssh: connect to host pi port 22: Connection refused",
@@ -198,14 +198,14 @@ def test_a_link_that_hangs_ends_by_the_deadline_with_all_that_it_started(
         ),
         (
             "Host key verification failed.",
-            "its host key is not known here, or was not accepted: ssh pi shows it",
+            "Host key verification failed: it is not known here, or was not accepted: ssh pi shows it",
         ),
         (
             "@ WARNING: REMOTE HOST IDENTIFICATION HAS CHANGED! @\nHost key verification failed.",
             "if that is meant, forget the old key: ssh-keygen -R pi",
         ),
-        ("ssh: connect to host pi port 22: No route to host", "nobody has the address pi: switched on"),
-        ("ssh: connect to host pi port 22: Connection timed out", "pi does not answer: switched on"),
+        ("ssh: connect to host pi port 22: No route to host", "nobody has the address pi: is it on"),
+        ("ssh: connect to host pi port 22: Connection timed out", "pi does not answer: is it on"),
     ],
 )
 def test_a_host_that_is_not_reached_is_reported_in_one_line_with_what_to_do(

@@ -88,7 +88,7 @@ def test_a_person_compares_an_unknown_host_key_and_accepts_it_or_not(rig: Rig) -
     known, options = hosts_known(rig, "")
     refused = at_home(rig, known_words(rig, options), (r"\(yes/no", "no"))
     assert refused.code == 1
-    assert "Host key verification failed: its host key is not known here, or was not accepted" in refused.out
+    assert "Host key verification failed: it is not known here, or was not accepted" in refused.out
     assert known.read_text() == ""
     taken = at_home(rig, known_words(rig, options), (r"\(yes/no", "yes"), ("sudo password of maker", BY_KEY))
     assert taken.code == 0, str(taken)

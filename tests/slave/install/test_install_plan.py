@@ -215,7 +215,7 @@ def test_what_config_txt_says_already_is_not_said_again() -> None:
         (
             {"available_mb": 90.0, "swap_mb": 0.0},
             "",
-            "90 MB of memory and swap free, needs 150 MB: Raspberry Pi OS Lite",
+            "90 MB of memory and swap free, needs 150 MB: switch swap on, or",
         ),
         ({"python": [3, 9]}, "", "its Python is 3.9, needs 3.11 or newer"),
         ({"python": [3, 15]}, "", "needs 3.11 to 3.14"),
