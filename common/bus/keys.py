@@ -338,6 +338,10 @@ class Access:
             raise BusError(
                 f"no keys: give --keys DIR or set {FOLDER}; phalanx fleet keys DIR --make makes them"
             )
+        if self.folder.is_dir() and not os.access(self.folder, os.R_OK | os.X_OK):
+            raise BusError(
+                f"{self.folder}: these keys are of root or of another user: sudo, or give other --keys"
+            )
         own = self._stem(self.folder)
         found = tuple(sorted(path.stem for path in (self.folder / DEVICES).glob("*.pem")))
         pem, key = (own.with_name(f"{own.name}.{ending}") for ending in ("pem", "key"))

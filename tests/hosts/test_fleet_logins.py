@@ -154,6 +154,11 @@ def test_two_hosts_with_different_passwords_are_asked_for_once_each_and_nobody_s
         assert found.returncode in (0, 1), found.stderr
         assert "only root may look: sudo phalanx-slave doctor" in found.stdout
         assert "Traceback" not in found.stderr
+        words = f"phalanx-slave run --name {host.name} --camera synthetic --keys /etc/phalanx/keys"
+        host.run("cp -r /var/lib/phalanx/calib_json /tmp && chmod -R a+rX /tmp/calib_json")
+        refused = host.try_run(f"cd /tmp; {user} {words}")
+        assert refused.returncode == 1
+        assert "/etc/phalanx/keys: these keys are of root or of another user: sudo, or" in refused.stderr
         assert host.try_run("ls /opt/phalanx/wheels").returncode != 0, "what was sent is gone"
 
 
