@@ -25,6 +25,7 @@ from slave.doctor.host import (
     check_clock,
     check_host,
     check_programs,
+    check_strobe,
     check_unit,
     exit_code,
     fail,
@@ -194,6 +195,8 @@ def _look(
         yield slave
         return
     yield from check_devices(system, slave)
+    if str(slave.lights).partition(":")[0] in ("gpio", "i2c"):
+        yield check_strobe(system, name)
     if slave.camera is not None:
         yield from check_camera(slave, runs)
     else:

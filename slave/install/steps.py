@@ -21,6 +21,7 @@ from slave.install.transaction import CURRENT, Transaction, alone, changed, poin
 from slave.install.wanted import (
     BOOT,
     CHRONY,
+    DROP_IN,
     ETC,
     KEYS,
     LINK,
@@ -128,7 +129,8 @@ def _difference(plan: Plan, files: dict[str, File | None], name: str, machine: M
         outcome.changed.append(CURRENT)
     everybodys = {UNIT, SYSUSERS, CURRENT, f"{KEYS}/rig.key", f"{KEYS}/ca.pem"}
     for sender in plan.senders:
-        own = {f"{ETC}/{sender.name}.env", *(f"{KEYS}/{file}" for file in wanted_keys([sender.name]))}
+        own = {f"{ETC}/{sender.name}.env", DROP_IN.format(sender.unit)}
+        own |= {f"{KEYS}/{file}" for file in wanted_keys([sender.name])}
         if (everybodys | own) & set(outcome.changed) or not machine.systemd.state(sender.unit).active:
             outcome.restarted.append(sender.unit)
     outcome.reboot = BOOT in outcome.changed
@@ -156,7 +158,7 @@ def _apply(plan: Plan, files: dict[str, File | None], name: str, outcome: Outcom
         run(["systemd-sysusers", str(root / SYSUSERS)])
     if CURRENT in outcome.changed:
         point(root / CURRENT, f"releases/{name}")
-    if UNIT in outcome.changed or any(path.endswith(".env") for path in outcome.changed):
+    if any(path.endswith((".env", ".service", "strobe.conf")) for path in outcome.changed):
         run(["systemctl", "daemon-reload"])
     if CHRONY in outcome.changed:
         _follow_clock(machine)

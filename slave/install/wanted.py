@@ -66,6 +66,7 @@ def _shown_to_all(text: str) -> set[str]:
 OPT, ETC, KEYS, CALIB = "opt/phalanx", "etc/phalanx", "etc/phalanx/keys", "var/lib/phalanx/calib_json"
 UNIT, SYSUSERS = "etc/systemd/system/phalanx-slave@.service", "etc/sysusers.d/phalanx.conf"
 LINK, COMMAND = "usr/local/bin/phalanx-slave", f"/{OPT}/current/bin/phalanx-slave"  # on everybody's PATH
+DROP_IN = "etc/systemd/system/{}.d/strobe.conf"  # of the service that switches lights
 CHRONY, BOOT, RECORD = "etc/chrony/conf.d/phalanx.conf", "boot/firmware/config.txt", f"{OPT}/installed.json"
 _CHRONY = """\
 # Written by the installer of Phalanx: the clock of the master's machine first, so that cameras agree with each other.
@@ -127,6 +128,7 @@ def wanted_files(plan: Plan, root: Path, record: Record) -> dict[str, File | Non
         )
     for sender in plan.senders:
         files[f"{ETC}/{sender.name}.env"] = File(sender.environment.encode())
+        files[DROP_IN.format(sender.unit)] = File(_own("strobe.conf")) if sender.stop_post else None
     if (root / CHRONY).parent.is_dir():
         files[CHRONY] = File(_CHRONY.format(master=plan.master).encode())
     if (root / BOOT).is_file():
@@ -199,6 +201,9 @@ def _gone(plan: Plan, root: Path) -> dict[str, File | None]:
     names = {sender.name for sender in plan.senders}
     gone = [path for path in (root / ETC).glob("*.env") if path.stem not in names]
     gone += [p for p in (root / KEYS).glob("device-*") if p.stem.removeprefix("device-") not in names]
+    units = {DROP_IN.format(sender.unit) for sender in plan.senders}
+    drop_ins = root.glob(DROP_IN.format("phalanx-slave@*.service"))
+    gone += [path for path in drop_ins if str(path.relative_to(root)) not in units]
     return {str(path.relative_to(root)): None for path in sorted(gone)}
 
 

@@ -14,6 +14,7 @@ frame might become a wrong one. A light that came on only after the exposure had
 """
 
 import logging
+import os
 import threading
 from collections import Counter, deque
 from dataclasses import dataclass
@@ -258,10 +259,14 @@ class Strobe:
 
 
 class StrobeController(Strobe):
-    """A strobe that works on a thread of its own."""
+    """A strobe that works on a thread of its own, which asks for real-time priority.
+
+    `missed` counts `not_realtime` where that is refused: the lights go on, but later (docs/safety.md).
+    """
 
     def __init__(self, schedule: StrobeSchedule, interlock: Interlock, clock: Clock) -> None:
         super().__init__(schedule, interlock, clock)
+        self.missed["not_realtime"] = 0
         self._closed = False
         self._thread = threading.Thread(target=self._work, name="strobe", daemon=True)
         self._thread.start()
@@ -275,7 +280,20 @@ class StrobeController(Strobe):
         self._thread.join()
         self._interlock.close()
 
+    def _ask_for_real_time(self) -> None:
+        """Ask for real-time priority of this thread, not of what it starts."""
+        priority = 10  # of 1 to 99; the kernel's own threads have 50. strobe.conf of the unit allows as much
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+        except OSError as error:
+            self.missed["not_realtime"] = 1
+            more = (
+                "a service gets it by its installer (strobe.conf), a program started by hand by `ulimit -r`"
+            )
+            _LOG.warning("lights: no real-time priority for the strobe (%s): %s", error.strerror, more)
+
     def _work(self) -> None:
+        self._ask_for_real_time()
         with self._news:
             try:
                 while not self._closed:

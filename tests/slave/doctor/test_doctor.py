@@ -29,6 +29,7 @@ from slave.doctor.host import (
     check_clock,
     check_host,
     check_programs,
+    check_strobe,
     check_unit,
     exit_code,
     fail,
@@ -334,6 +335,35 @@ def test_the_service_as_systemd_reports_it(
     finding, has_device = check_unit(machine(tmp_path, {"systemctl": Ran(0, output, "")}), "left")
     assert (finding.verdict, has_device) == (verdict, runs)
     assert text in finding.text
+
+
+STAT = "{0} (a (thread) of it) S " + "0 " * 36 + "{1} {2} 0 0\n"  # proc_pid_stat(5): 40 priority, 41 policy
+
+
+@pytest.mark.parametrize(
+    ("pid", "priorities", "verdict", "text"),
+    [
+        (812, (0, 10, 0), Verdict.OK, "real-time priority 10"),
+        (812, (0, 0), Verdict.WARN, "no real-time priority"),
+        (0, (), Verdict.UNSEEN, "does not run"),
+    ],
+)
+def test_the_strobes_priority_is_read_from_the_running_service(
+    tmp_path: Path, pid: int, priorities: tuple[int, ...], verdict: Verdict, text: str
+) -> None:
+    files = {
+        f"proc/{pid}/task/{pid + k}/stat": STAT.format(pid + k, priority, int(priority > 0))
+        for k, priority in enumerate(priorities)
+    }
+    system = machine(tmp_path, {"systemctl": Ran(0, f"MainPID={pid}\n", "")}, files)
+    finding = check_strobe(system, "wrist")
+    assert (finding.verdict, text in finding.text) == (verdict, True)
+    assert ("strobe.conf" in finding.fix) == (verdict is Verdict.WARN)
+
+
+def test_the_fields_of_a_thread_are_those_of_the_kernel() -> None:
+    own = Path("/proc/thread-self/stat").read_text().rpartition(")")[2].split()
+    assert own[37:39] == ["0", str(os.sched_getscheduler(0))]
 
 
 def test_what_is_installed_is_looked_at_by_itself(tmp_path: Path) -> None:

@@ -125,6 +125,7 @@ class Board:
         self,
         site: Path,
         *words: str,
+        name: str = "left",
         keys: bool = True,
         calibration: Path | None = None,
         dry_run: bool = False,
@@ -132,9 +133,7 @@ class Board:
         """Install what is in `site` with these options."""
         parser = argparse.ArgumentParser()
         arguments.add_install(parser)
-        options = parser.parse_args(
-            ["--master", "10.0.0.2", "--name", "left", "--camera", "synthetic", *words]
-        )
+        options = parser.parse_args(["--master", "10.0.0.2", "--name", name, "--camera", "synthetic", *words])
         plan = plan_of(
             options, calibration_of(calibration or ROOT / "calib_json"), keys_of(self.keys if keys else None)
         )
@@ -159,9 +158,9 @@ class Board:
 
 @pytest.fixture(scope="session")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A keys folder of a PC, for left and right."""
+    """A keys folder of a PC, for left, right and a wrist device."""
     folder = tmp_path_factory.mktemp("keys") / "keys"
-    make(folder, ("left", "right"), datetime.now(UTC))
+    make(folder, ("left", "right", "wrist"), datetime.now(UTC))
     return folder
 
 

@@ -146,6 +146,30 @@ def test_a_sender_that_is_served_no_more_is_removed_with_its_keys(board: Board, 
     assert set(board.systemd.pids) == {UNIT}
 
 
+def test_real_time_is_allowed_to_a_slave_that_switches_lights_and_to_no_other(
+    board: Board, site: Path
+) -> None:
+    drop_in = board.root / "etc/systemd/system/phalanx-slave@wrist.service.d/strobe.conf"
+    wrist, lights = ("--rig", "wrist"), ("--lights", "gpio:0:17,27")
+    outcome = board.install(site, *wrist, *lights, name="wrist")
+    assert outcome.restarted == ["phalanx-slave@wrist.service"]
+    assert drop_in.read_text() == (ROOT / "slave/install/files/strobe.conf").read_text()
+    asked = len(board.systemd.asked)
+    drop_in.unlink()  # as a release before this one left it: no other file of ours is different
+    outcome = board.install(site, *wrist, *lights, name="wrist")
+    assert outcome.changed == [str(drop_in.relative_to(board.root))]
+    assert outcome.restarted == ["phalanx-slave@wrist.service"]
+    assert "systemctl daemon-reload" in board.systemd.asked[asked:]
+    board.install(site, *wrist, "--lights", "camera", name="wrist")  # others switch them
+    assert not drop_in.exists()
+    board.install(site, *wrist, *lights, name="wrist")
+    board.install(site)
+    assert not drop_in.exists()
+    board.install(site, *wrist, *lights, name="wrist")
+    uninstall(board.machine)
+    assert not drop_in.parent.exists()
+
+
 def test_an_upgrade_keeps_the_release_before_and_no_other(board: Board, tmp_path: Path) -> None:
     names = [board.install(site_of(tmp_path / f"site{n}", f"1.{n}")).release for n in range(3)]
     assert sorted(p.name for p in (board.root / "opt/phalanx/releases").iterdir()) == sorted(names[1:])

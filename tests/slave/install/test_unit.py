@@ -14,7 +14,10 @@ from tests.programs import needs
 
 ROOT = Path(__file__).resolve().parents[3]
 FILES = resources.files("slave.install") / "files"
-UNIT = FILES / "phalanx-slave@.service"
+UNIT, STROBE = (
+    FILES / "phalanx-slave@.service",
+    FILES / "strobe.conf",
+)  # the second: of a slave that switches lights
 MOST_EXPOSED = 25  # of 250; systemd-analyze counts in tenths
 # What the unit mentions, so that nothing of this machine's own systemd takes part.
 TARGETS = ("sysinit", "basic", "shutdown", "multi-user", "network")
@@ -25,8 +28,8 @@ def settings(text: str) -> list[tuple[str, str]]:
     return [(key, value) for key, value in re.findall(r"^(\w+)=(.*)$", text, re.MULTILINE)]
 
 
-def verified(tmp_path: Path, text: str) -> str:
-    """What systemd says about this text as our unit: nothing, or what is wrong."""
+def verified(tmp_path: Path, text: str, strobe: str = "") -> str:
+    """What systemd says about this text as our unit, and its drop-in: nothing, or what is wrong."""
     needs("systemd-analyze")
     units = tmp_path / "etc/systemd/system"
     units.mkdir(parents=True)
@@ -39,13 +42,23 @@ def verified(tmp_path: Path, text: str) -> str:
         path.write_text("#!/bin/sh\n")
         path.chmod(0o755)
     (units / "phalanx-slave@.service").write_text(text)
+    if strobe:
+        (units / "phalanx-slave@left.service.d").mkdir()
+        (units / "phalanx-slave@left.service.d/strobe.conf").write_text(strobe)
     command = ["systemd-analyze", "verify", "--man=no", f"--root={tmp_path}", "phalanx-slave@left.service"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     return done.stderr + done.stdout + ("" if done.returncode == 0 else f"exit {done.returncode}")
 
 
-def test_systemd_has_nothing_to_say_about_the_unit(tmp_path: Path) -> None:
-    assert verified(tmp_path, UNIT.read_text()) == ""
+@pytest.mark.parametrize("strobe", ["", STROBE.read_text()], ids=["plain", "strobe"])
+def test_systemd_has_nothing_to_say_about_the_unit(tmp_path: Path, strobe: str) -> None:
+    assert verified(tmp_path, UNIT.read_text(), strobe) == ""
+
+
+def test_a_slip_in_the_drop_in_would_be_said(tmp_path: Path) -> None:
+    assert "strobe.conf:5: Failed" in verified(
+        tmp_path, UNIT.read_text(), STROBE.read_text().replace("=10", "=ten")
+    )
 
 
 @pytest.mark.parametrize(
@@ -64,9 +77,12 @@ def test_a_slip_in_the_unit_would_be_said(tmp_path: Path, old: str, new: str, ou
 
 
 @pytest.mark.parametrize(("drop", "passes"), [(None, True), ("SystemCallFilter", False)])
-def test_exposure_of_the_unit(tmp_path: Path, drop: str | None, passes: bool) -> None:
+@pytest.mark.parametrize("strobe", [False, True])
+def test_exposure_of_the_unit(tmp_path: Path, strobe: bool, drop: str | None, passes: bool) -> None:
     needs("systemd-analyze")
     text = UNIT.read_text()
+    if strobe:  # what comes later counts, as in a drop-in
+        text = text.replace("[Install]", f"{STROBE.read_text()}\n[Install]")
     unit = tmp_path / "phalanx-slave@.service"
     unit.write_text(text if drop is None else re.sub(rf"^{drop}=.*$", "", text, flags=re.MULTILINE))
     done = subprocess.run(
@@ -84,6 +100,21 @@ def test_exposure_of_the_unit(tmp_path: Path, drop: str | None, passes: bool) ->
         check=False,
     )
     assert (done.returncode == 0) is passes, done.stdout[-200:] + done.stderr
+
+
+def test_the_call_that_asks_for_real_time_passes_the_filter_of_system_calls() -> None:
+    needs("systemd-analyze")
+
+    def calls(name: str) -> set[str]:
+        command = ["systemd-analyze", "syscall-filter", "--no-pager", name]
+        lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+        words = {line.strip() for line in lines[1:] if line.strip() and not line.strip().startswith("#")}
+        return {call for word in words for call in (calls(word) if word.startswith("@") else {word})}
+
+    filters = [value for key, value in settings(UNIT.read_text()) if key == "SystemCallFilter"]
+    assert filters == ["@system-service", "~@privileged"]
+    assert {"sched_setscheduler", "read"} <= calls("@system-service") - calls("@privileged")
+    assert "setuid" not in calls("@system-service") - calls("@privileged")
 
 
 def test_every_group_of_the_unit_is_made_and_known_to_the_doctor() -> None:
@@ -120,3 +151,4 @@ def test_the_files_of_the_unit_are_in_the_wheel(tmp_path: Path) -> None:
     listed = zipfile.ZipFile(wheel).namelist()
     assert "slave/install/files/phalanx-slave@.service" in listed
     assert "slave/install/files/phalanx.sysusers.conf" in listed
+    assert "slave/install/files/strobe.conf" in listed
