@@ -225,20 +225,19 @@ class Drivers:
         # a simulated board is not lit
         if lights is None or (lights == SYNTHETIC and self.options.scene == "board"):
             return self._camera(camera)
-        from slave.lights.controller import StrobeController
-        from slave.lights.strobed import SimulatedStrobe, StrobedCamera, schedule_of
+        from slave.lights.strobed import SimulatedStrobe, StrobedCamera, StrobeProcess, schedule_of
 
         limits, schedule = light_limits(lights, rig), schedule_of(rig, camera)
         if lights == SYNTHETIC:
             strobe = SimulatedStrobe(schedule, limits)
             return StrobedCamera(self._camera(camera, strobe), camera, rig, strobe)
-        interlock = open_lights(lights, rig)
+        process = StrobeProcess(lights, rig, camera, self.clock)
         try:
             source = self._camera(camera)
         except Exception:
-            interlock.close()
+            process.close()
             raise
-        return StrobedCamera(source, camera, rig, StrobeController(schedule, interlock, self.clock))
+        return StrobedCamera(source, camera, rig, process)
 
     def _camera(self, camera: CameraCalibration, lights: "SimulatedStrobe | None" = None) -> FrameSource:
         options, clock, wrist = self.options, self.clock, self.rig.kind == "wrist"
@@ -407,16 +406,12 @@ def light_limits(lights: str, rig: RigCalibration) -> StrobeCalibration:
 def open_lights(lights: str, rig: RigCalibration) -> Interlock:
     """Open real lights, dark, within the limits of the rig file."""
     strobe = light_limits(lights, rig)
-    kind, place = driver_of("--lights", lights, LIGHTS, LightsError)
-    if kind == "gpio":
-        from slave.lights.gpio import GpioLights
+    driver_of("--lights", lights, LIGHTS, LightsError)
+    from slave.lights.strobed import switched_lights
 
-        return Interlock(GpioLights(place, strobe.max_pulse_us * 1e-6), strobe)
-    if kind == "i2c":
-        from slave.lights.i2c_led import FlashDriverLights
-
-        return Interlock(FlashDriverLights(place, strobe), strobe)
-    raise LightsError(f"--lights {lights}: the slave does not switch these; it does {SWITCHED_LIGHTS}")
+    if (driver := switched_lights(lights, strobe)) is None:
+        raise LightsError(f"--lights {lights}: the slave does not switch these; it does {SWITCHED_LIGHTS}")
+    return Interlock(driver, strobe)
 
 
 def _pixels(kind: str, as_luma: bool, wrist: bool) -> Pixels:

@@ -342,17 +342,17 @@ def check_unit(system: System, name: str) -> tuple[Finding, bool]:
 def check_strobe(system: System, name: str) -> Finding:
     """Whether the running service's strobe has the real-time priority it asks for."""
     unit, check = f"phalanx-slave@{name}.service", "strobe"
-    pid = pairs(system.run(("systemctl", "show", unit, "--property=MainPID"), 10.0).out).get("MainPID", "0")
-    tasks = f"proc/{pid}/task"
-    stats = [system.text(f"{tasks}/{one.name}/stat") for one in system.path(tasks).glob("*")]
+    asked = system.run(("systemctl", "show", unit, "--property=ControlGroup"), 10.0)
+    group = f"sys/fs/cgroup/{pairs(asked.out).get('ControlGroup', '')}/cgroup.procs"
+    stats = [system.text(f"proc/{pid}/stat") for pid in (system.text(group) or "").split()]
     # proc_pid_stat(5): field 40 is the priority, 3 the first behind the name in brackets
     found = [int(text.rpartition(")")[2].split()[37]) for text in stats if text]
     if not found:
-        return unseen(check, "the service does not run: its thread's priority is not known")
+        return unseen(check, "the service does not run, or this system has no control groups of version 2")
     if max(found) == 0:
         fix = f"phalanx fleet deploy writes {unit}.d/strobe.conf, which allows it; then restart the service"
         return warn(check, "no real-time priority: frames stay dark where other work makes it late", fix)
-    return ok(check, f"its thread has real-time priority {max(found)}")
+    return ok(check, f"its process has real-time priority {max(found)}")
 
 
 CURRENT = "/opt/phalanx/current"

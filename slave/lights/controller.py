@@ -14,8 +14,6 @@ frame might become a wrong one. A light that came on only after the exposure had
 """
 
 import logging
-import os
-import threading
 from collections import Counter, deque
 from dataclasses import dataclass
 
@@ -163,12 +161,12 @@ _LOG = logging.getLogger(__name__)
 class Strobe:
     """Switches the light of each frame, as predicted from the stamps of those before.
 
+    Whoever has it calls `step` when that asks to; all calls come from one thread.
     `missed`: pulses `skipped`, as it was too late for them; `late`, ended at once, as the driver took too long.
     """
 
     def __init__(self, schedule: StrobeSchedule, interlock: Interlock, clock: Clock) -> None:
         self._schedule, self._interlock, self._clock = schedule, interlock, clock
-        self._news = threading.Condition()
         self._on: Pulse | None = None
         self._number = -1
         self._rest_until_ns: int | None = None
@@ -177,23 +175,18 @@ class Strobe:
 
     def push(self, seq: int, t_ns: int) -> None:
         """Take a frame's mid-exposure [ns]."""
-        with self._news:
-            if self._schedule.push(seq, t_ns):
-                self._number = -1
-            self._news.notify_all()
+        if self._schedule.push(seq, t_ns):
+            self._number = -1
 
     def expose(self, exposure_us: float) -> None:
         """Take another exposure time [us]."""
-        with self._news:
-            self._schedule.expose(exposure_us)
+        self._schedule.expose(exposure_us)
 
     def stalled(self) -> None:
         """Go dark, and forget the stamps: there are no frames any more."""
-        with self._news:
-            self._schedule.forget()
-            self._number = -1
-            self._dark()
-            self._news.notify_all()
+        self._schedule.forget()
+        self._number = -1
+        self._dark()
 
     def counts(self) -> dict[str, int]:
         """`lights.<event>` -> how often, of lights, strobe and schedule."""
@@ -202,8 +195,7 @@ class Strobe:
 
     def close(self) -> None:
         """Go dark, give the lights back. Safe to call twice."""
-        with self._news:
-            self._dark()
+        self._dark()
         self._interlock.close()
 
     def step(self) -> int | None:
@@ -256,51 +248,3 @@ class Strobe:
         if self._logged_ns is None or now_ns - self._logged_ns >= 10_000_000_000:  # one line in ten seconds
             self._logged_ns = now_ns
             _LOG.warning("lights: %s", error)
-
-
-class StrobeController(Strobe):
-    """A strobe that works on a thread of its own, which asks for real-time priority.
-
-    `missed` counts `not_realtime` where that is refused: the lights go on, but later (docs/safety.md).
-    """
-
-    def __init__(self, schedule: StrobeSchedule, interlock: Interlock, clock: Clock) -> None:
-        super().__init__(schedule, interlock, clock)
-        self.missed["not_realtime"] = 0
-        self._closed = False
-        self._thread = threading.Thread(target=self._work, name="strobe", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Go dark, end the thread, give the lights back; as of `Strobe`."""
-        with self._news:
-            self._closed = True
-            self._dark()
-            self._news.notify_all()
-        self._thread.join()
-        self._interlock.close()
-
-    def _ask_for_real_time(self) -> None:
-        """Ask for real-time priority of this thread, not of what it starts."""
-        priority = 10  # of 1 to 99; the kernel's own threads have 50. strobe.conf of the unit allows as much
-        try:
-            os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
-        except OSError as error:
-            self.missed["not_realtime"] = 1
-            more = (
-                "a service gets it by its installer (strobe.conf), a program started by hand by `ulimit -r`"
-            )
-            _LOG.warning("lights: no real-time priority for the strobe (%s): %s", error.strerror, more)
-
-    def _work(self) -> None:
-        self._ask_for_real_time()
-        with self._news:
-            try:
-                while not self._closed:
-                    again_ns = self.step()
-                    if again_ns is None:
-                        self._news.wait(0.5)  # there are no frames
-                    elif (left_s := (again_ns - self._clock.now_ns()) * 1e-9) > 0.0:
-                        self._news.wait(left_s)
-            finally:
-                self._dark()

@@ -351,11 +351,15 @@ STAT = "{0} (a (thread) of it) S " + "0 " * 36 + "{1} {2} 0 0\n"  # proc_pid_sta
 def test_the_strobes_priority_is_read_from_the_running_service(
     tmp_path: Path, pid: int, priorities: tuple[int, ...], verdict: Verdict, text: str
 ) -> None:
+    group = "system.slice/system-phalanx.slice/phalanx-slave@wrist.service"
     files = {
-        f"proc/{pid}/task/{pid + k}/stat": STAT.format(pid + k, priority, int(priority > 0))
+        f"proc/{pid + k}/stat": STAT.format(pid + k, priority, int(priority > 0))
         for k, priority in enumerate(priorities)
     }
-    system = machine(tmp_path, {"systemctl": Ran(0, f"MainPID={pid}\n", "")}, files)
+    if pid:
+        gone = pid + 99  # it ended meanwhile
+        files[f"sys/fs/cgroup/{group}/cgroup.procs"] = f"{pid}\n{pid + 1}\n{gone}\n{pid + 2}\n"
+    system = machine(tmp_path, {"systemctl": Ran(0, f"ControlGroup=/{group}\n", "")}, files)
     finding = check_strobe(system, "wrist")
     assert (finding.verdict, text in finding.text) == (verdict, True)
     assert ("strobe.conf" in finding.fix) == (verdict is Verdict.WARN)

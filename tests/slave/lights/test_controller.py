@@ -1,14 +1,10 @@
 """The strobe lights every frame by its kind and no other; late wake-ups, stalls, failing drivers leave frames dark."""
 
-import threading
-import time
-
 import numpy as np
 import pytest
 
-from common.clock import SystemClock
 from common.recording.frame_recording import Illumination
-from slave.lights.controller import CYCLE, FAILED_NS, LEAST, Strobe, StrobeController, StrobeSchedule
+from slave.lights.controller import CYCLE, FAILED_NS, LEAST, Strobe, StrobeSchedule
 from slave.lights.interlock import WINDOW_NS, Interlock
 from tests.slave.lights.stage import (
     AMBIENT,
@@ -141,41 +137,6 @@ def test_a_driver_that_is_unplugged_is_tried_again_and_comes_back() -> None:
     rest = round((FAILED_NS + WINDOW_NS) / PERIOD_NS) + 3
     stage.run(range(60, 60 + rest + 30))
     assert stage.kind(60 + rest + 10) is CYCLE[(60 + rest + 10) % 3]
-
-
-def test_the_thread_lights_the_scheduled_frames_and_ends_dark() -> None:
-    clock = SystemClock()
-    begun = threading.Event()
-
-    class Real(NotedLights):
-        def switch(self, lit: Illumination) -> None:
-            self.switched.append((clock.now_ns(), lit))
-            if lit is not AMBIENT:
-                begun.set()
-
-    lights = Real(SetClock())
-    interlock = Interlock(lights, STROBE)
-    controller = StrobeController(StrobeSchedule(90.0, 2000.0, 1000.0), interlock, clock)
-    first_ns = clock.now_ns()
-    for k in range(-20, 0):  # a camera that has run for a while
-        controller.push(k + 21, first_ns + round(k * PERIOD_NS))
-    deadline = time.monotonic() + 60.0
-    k = 0
-    while not begun.is_set() and time.monotonic() < deadline:
-        controller.push(k + 21, first_ns + round(k * PERIOD_NS))
-        k += 1
-        time.sleep(max((first_ns + k * PERIOD_NS - clock.now_ns()) * 1e-9, 0.0))
-    assert begun.is_set()
-    controller.stalled()
-    assert lights.lit is AMBIENT
-    seen = len(lights.switched)
-    controller.close()
-    controller.close()
-    assert lights.closed
-    assert all(lit is AMBIENT for _, lit in lights.switched[seen:])
-    counts = controller.counts()
-    assert counts["lights.pulses"] >= 1
-    assert {"lights.skipped", "lights.late", "lights.refused", "lights.off_by_watchdog"} <= set(counts)
 
 
 def test_exposures_do_not_touch() -> None:

@@ -1,4 +1,4 @@
-"""The strobe's thread has real-time priority where the machine allows it; where not it is counted, and lights go on."""
+"""The strobe's process has real-time priority where that is allowed; where not it is counted, and lights go on."""
 
 import json
 import os
@@ -6,23 +6,24 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.programs import needs
 
 ROOT = Path(__file__).resolve().parents[3]
+LIBRARY = ROOT / "tests/slave/lights/library"
 STROBE_CONF = (ROOT / "slave/install/files/strobe.conf").read_text()
 ALLOWED = int(re.findall(r"^LimitRTPRIO=(\d+)$", STROBE_CONF, re.MULTILINE)[0])
 
 # A strobe with stamps of frames, and what its thread is. argv: whether real time is forbidden as by RestrictRealtime=,
 # by a filter of system calls (seccomp(2)) that refuses sched_setscheduler with any policy but the ordinary ones.
 PROGRAM = """
-import ctypes, json, os, platform, struct, sys, threading, time
-from common.clock import SystemClock
-from slave.lights.controller import StrobeController, StrobeSchedule
-from slave.lights.interlock import Interlock
-from tests.slave.lights.stage import AMBIENT, PERIOD_NS, STROBE, NotedLights, SetClock
+import ctypes, json, os, platform, struct, sys, time
+from common.clock import SkewedClock
+from slave.lights.strobed import StrobeProcess
+from tests.slave.lights.stage import CAMERA, PERIOD_NS, RIG
 
 def restrict_real_time():
     call = {"x86_64": 144, "aarch64": 119}[platform.machine()]
@@ -40,28 +41,27 @@ def restrict_real_time():
 if sys.argv[1] == "restricted":
     restrict_real_time()
 
-class Lights(NotedLights):
-    def switch(self, lit):
-        self.switched.append((time.monotonic_ns(), lit))
-
-clock, lights = SystemClock(), Lights(SetClock())
-controller = StrobeController(StrobeSchedule(90.0, 2000.0, 1000.0), Interlock(lights, STROBE), clock)
-first_ns, k = clock.now_ns() - round(20 * PERIOD_NS), 0
-while controller.counts()["lights.pulses"] < 2 and k < 5400:
+clock = SkewedClock(0, 0.0)
+strobe = StrobeProcess("gpio:0:17,27", RIG, CAMERA, clock)
+first_ns, k = clock.now_ns(), 0
+while strobe.counts()["lights.pulses"] < 2 and k < 5400:
     stamp_ns = first_ns + round(k * PERIOD_NS)
     time.sleep(max((stamp_ns - clock.now_ns()) * 1e-9, 0.0))
-    controller.push(k, stamp_ns)
+    strobe.push(k, stamp_ns)
     k += 1
-thread = next(one for one in threading.enumerate() if one.name == "strobe")
-policy = os.sched_getscheduler(thread.native_id) & ~os.SCHED_RESET_ON_FORK
-priority = os.sched_getparam(thread.native_id).sched_priority
-others = {os.sched_getscheduler(one.native_id) for one in threading.enumerate() if one is not thread}
-controller.close()
-print(json.dumps({"policy": policy, "priority": priority, "others": sorted(others), **controller.counts()}))
+tasks = [int(one) for one in os.listdir(f"/proc/{strobe._process.pid}/task")]
+policies = sorted({os.sched_getscheduler(one) for one in tasks})
+priority = os.sched_getparam(tasks[0]).sched_priority
+own = sorted({os.sched_getscheduler(int(one)) for one in os.listdir("/proc/self/task")})
+found = {"policies": policies, "priority": priority, "own": own, **strobe.counts()}
+strobe.close()
+print(json.dumps(found))
 """
 
 
-def strobe(limit: int, capability: bool = False, restricted: bool = False) -> tuple[dict[str, int], str]:
+def strobe(
+    log: Path, limit: int, capability: bool = False, restricted: bool = False
+) -> tuple[dict[str, Any], str]:
     """What a process without rights is granted, and what it logs.
 
     `limit` is RLIMIT_RTPRIO, as LimitRTPRIO= sets it; `capability` keeps CAP_SYS_NICE of all rights of root.
@@ -79,7 +79,7 @@ def strobe(limit: int, capability: bool = False, restricted: bool = False) -> tu
     done = subprocess.run(
         [*command, "restricted" if restricted else "free"],
         cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": f"{LIBRARY}:{ROOT}", "PHALANX_FAKE_GPIO": str(log)},
         capture_output=True,
         text=True,
         timeout=120,
@@ -90,10 +90,12 @@ def strobe(limit: int, capability: bool = False, restricted: bool = False) -> tu
 
 
 @pytest.mark.parametrize(("limit", "capability"), [(ALLOWED, False), (0, True)])
-def test_its_thread_alone_has_it_where_it_is_allowed(limit: int, capability: bool) -> None:
-    found, log = strobe(limit, capability, restricted="RestrictRealtime=no" not in STROBE_CONF)
-    assert (found["policy"], found["priority"]) == (os.SCHED_FIFO, ALLOWED)
-    assert found["others"] == [os.SCHED_OTHER]  # the detector's threads do not
+def test_its_process_alone_has_it_where_it_is_allowed(tmp_path: Path, limit: int, capability: bool) -> None:
+    found, log = strobe(
+        tmp_path / "lines", limit, capability, restricted="RestrictRealtime=no" not in STROBE_CONF
+    )
+    assert (found["policies"], found["priority"]) == ([os.SCHED_FIFO], ALLOWED)
+    assert found["own"] == [os.SCHED_OTHER]  # the detector's do not
     assert found["lights.not_realtime"] == 0
     assert found["lights.pulses"] >= 2
     assert log == ""
@@ -104,10 +106,10 @@ def test_its_thread_alone_has_it_where_it_is_allowed(limit: int, capability: boo
     [(0, False, False), (ALLOWED - 1, False, False), (0, True, True), (ALLOWED, False, True)],
 )
 def test_where_it_is_refused_it_is_counted_and_logged_and_lights_go_on(
-    limit: int, capability: bool, restricted: bool
+    tmp_path: Path, limit: int, capability: bool, restricted: bool
 ) -> None:
-    found, log = strobe(limit, capability, restricted)
-    assert (found["policy"], found["lights.not_realtime"]) == (os.SCHED_OTHER, 1)
+    found, log = strobe(tmp_path / "lines", limit, capability, restricted)
+    assert (found["policies"], found["lights.not_realtime"]) == ([os.SCHED_OTHER], 1)
     assert found["lights.pulses"] >= 2
     assert "no real-time priority for the strobe (Operation not permitted)" in log
     assert "strobe.conf" in log
