@@ -1,31 +1,31 @@
-// A bar that holds two Raspberry Pi camera modules side by side, looking along -z of the print, and one tripod nut.
+// A bar that holds two cameras side by side, looking along -z of the print, and one tripod nut.
 // Print it flat, front face down, 0.2 mm layers, 4 walls, 40 % infill; PETG or PLA. All lengths in millimetres.
+//   openscad -D 'camera="gs"' -o camera_bar_gs.stl camera_bar.scad
+use <cameras.scad>
 
+camera = "module";    // a name of cameras.scad
 baseline = 75;        // lens to lens: the rig file's T_rig_camera is measured, this only has to stay as it is
-bar = [120, 34, 8];   // a stiff bar is what the calibration lives on: do not make it thinner
-board = [25, 24];     // camera module 1, 2 and 3
-holes = [21, 12.5];   // M2, of the same modules
-hole_edge = 2;        // from the board's upper edge to the upper pair of holes
-screw = 1.7;          // M2 x 8 cuts its own thread in this
+bar_z = 8;            // a stiff bar is what the calibration lives on: do not make it thinner
 stand = 3;            // pillars: the board's parts need room behind it
-window = [13, 15];    // through which the lens looks; it is in the board's middle line, so lens to lens is `baseline`
 nut = [12.8, 5.6];    // 1/4"-20 UNC: width across corners, height
 thread = 6.6;
 boss = [20, 20, 17];  // about the nut, which is thicker than the bar
 
+board = board_of(camera)[1];
+bore = board_of(camera)[4];
+bar = [baseline + board.x + 20, board.y + 10, bar_z];
+
 $fn = 48;
 
 module seat() {
-  // The window, and below it the room for the ribbon cable.
-  translate([0, -1, -1]) linear_extrude(bar.z + 2) square(window, center = true);
-  translate([0, -bar.y / 2, bar.z / 2 + 2]) cube([18, 14, bar.z], center = true);
-  for (x = [-1, 1], y = [0, 1])
-    translate([x * holes.x / 2, board.y / 2 - hole_edge - y * holes.y, 1.2]) cylinder(d = screw, h = bar.z + stand);
+  // The window, and below it the room for the ribbon cable; it runs into a round window, so that no sliver is left between.
+  translate([0, 0, -1]) linear_extrude(bar.z + 2) window(camera);
+  translate([-9, -bar.y / 2 - 1, 2]) cube([18, board_of(camera)[6] ? 13 : 8, bar.z]);
+  for (screw = screws_of(camera)) translate([screw.x, screw.y, 1.2]) cylinder(d = bore, h = bar.z + stand);
 }
 
 module pillars() {
-  for (x = [-1, 1], y = [0, 1])
-    translate([x * holes.x / 2, board.y / 2 - hole_edge - y * holes.y, bar.z - 0.01]) cylinder(d = 4.4, h = stand);
+  for (screw = screws_of(camera)) translate([screw.x, screw.y, bar.z - 0.01]) cylinder(d = bore + 2.7, h = stand);
 }
 
 difference() {
