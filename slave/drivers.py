@@ -10,7 +10,7 @@ REAL_IMUS = "ximu3:PORT[@BAUD] | lsm6dsox:BUS[:ADDRESS]"
 IMUS = f"{REAL_IMUS} | synthetic"
 REAL_TRACKERS = "openvr | survive | survive:FILE"
 TRACKERS = f"{REAL_TRACKERS} | synthetic"
-SWITCHED_LIGHTS = "gpio:CHIP:LASER,LED | i2c:BUS[:ADDRESS]"
+SWITCHED_LIGHTS = "gpio:CHIP:LASER,LED[,SYNC] | i2c:BUS[:ADDRESS]"
 LIGHTS = f"{SWITCHED_LIGHTS} | camera | external"
 SCANS = ("auto", "full", "windows")
 # The units of a table of an IMU, by what is measured; a test compares them with `common.imu.csv_table`.

@@ -8,6 +8,9 @@ last ones by least squares, numbers counted by time alone (so that lost frames d
 frames will be. There is no schedule until an exposure is known to a part of the lead, and none beyond `AHEAD` periods
 after the last frame: a camera that stalls is not lit.
 
+Where a GPIO line of the camera shows its exposures, their starts as the kernel stamped them take the place of all
+stamps of frames; a camera that is silent on it is not lit (`no_sync`).
+
 A light goes on a lead before its exposure and off right after it. Whoever comes too late for the beginning of an
 exposure skips that pulse (`skipped`): a frame without its light makes no cycle, a light that smears into the next
 frame might become a wrong one. A light that came on only after the exposure had begun goes off at once (`late`).
@@ -109,6 +112,10 @@ class StrobeSchedule:
                 self._line = self._fitted()
         return False
 
+    def stamp_of(self, start_ns: int) -> int:
+        """The stamp that a frame would have whose exposure starts then [ns]."""
+        return start_ns + self._half_ns - self._offset_ns
+
     def forget(self) -> None:
         """The camera has stopped: predict nothing until its frames are known anew."""
         self._stamps.clear()
@@ -162,7 +169,8 @@ class Strobe:
     """Switches the light of each frame, as predicted from the stamps of those before.
 
     Whoever has it calls `step` when that asks to; all calls come from one thread.
-    `missed`: pulses `skipped`, as it was too late for them; `late`, ended at once, as the driver took too long.
+    `missed`: pulses `skipped`, as it was too late for them; `late`, ended at once, as the driver took too long; frames
+    for whose exposures the camera's line has shown nothing any more, `no_sync`.
     """
 
     def __init__(self, schedule: StrobeSchedule, interlock: Interlock, clock: Clock) -> None:
@@ -171,12 +179,22 @@ class Strobe:
         self._number = -1
         self._rest_until_ns: int | None = None
         self._logged_ns: int | None = None
-        self.missed = Counter({"skipped": 0, "late": 0})
+        self._silent = 0  # frames since the camera's line last showed an exposure
+        self.missed = Counter({"skipped": 0, "late": 0, "no_sync": 0})
 
     def push(self, seq: int, t_ns: int) -> None:
-        """Take a frame's mid-exposure [ns]."""
-        if self._schedule.push(seq, t_ns):
-            self._number = -1
+        """Take a frame's mid-exposure [ns], or what the camera's line showed of others."""
+        try:
+            starts = self._interlock.exposure_starts()
+        except LightsError as error:
+            self._log_fault(t_ns, error)
+            starts = []
+        stamps = [t_ns] if starts is None else [self._schedule.stamp_of(start_ns) for start_ns in starts]
+        self._silent = 0 if stamps else self._silent + 1
+        self.missed["no_sync"] += self._silent > AHEAD
+        for stamp_ns in stamps:
+            if self._schedule.push(seq, stamp_ns):
+                self._number = -1
 
     def expose(self, exposure_us: float) -> None:
         """Take another exposure time [us]."""

@@ -1,8 +1,9 @@
 """Switch laser and LEDs behind two GPIO lines, by libgpiod 2.
 
-`gpio:CHIP:LASER,LED`: the chip as a path, a name or a number, the lines as numbers of the chip or by name; `/low`
-after a line that lights when it is low. Both lines are set by one call of the kernel, so never is one half of a
-change seen, and read back.
+`gpio:CHIP:LASER,LED[,SYNC]`: the chip as a path, a name or a number, the lines as numbers of the chip or by name;
+`/low` after a line that lights when it is low. Both lines are set by one call of the kernel, so never is one half of
+a change seen, and read back. SYNC is an input that the camera sets while it exposes: the kernel stamps its edges
+(CLOCK_MONOTONIC) when they happen, however busy the machine is.
 
 A slave that is killed or stopped during a pulse darkens nothing, and the chip's driver may keep a pin's level. So a
 second process inherits the request, is sent every pulse, and sets the lines dark when one lasts too long or the first
@@ -36,7 +37,9 @@ INSTALL = (
     "--lights gpio needs the library gpiod 2: pip install 'phalanx-hand[wrist]', or on Raspberry Pi OS"
     " `sudo apt install python3-libgpiod` and a virtual environment made with --system-site-packages"
 )
-FORM = "write gpio:CHIP:LASER,LED, for example gpio:0:17,27; gpio:0:17,27/low where low lights the LEDs"
+FORM = (
+    "write gpio:CHIP:LASER,LED[,SYNC], for example gpio:0:17,27; gpio:0:17,27/low where low lights the LEDs"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,16 +62,18 @@ class GpioLights(Lights):
     """`Lights` behind two GPIO lines."""
 
     def __init__(self, place: str, longest_s: float) -> None:
-        """Request CHIP:LASER,LED, dark; no light is on for more than `longest_s` [s]."""
+        """Request CHIP:LASER,LED[,SYNC], dark; none is on for over `longest_s` [s]."""
         chip, colon, lines = place.rpartition(":")
         names = lines.split(",")
-        if not colon or not chip or len(names) != 2:
+        if not colon or not chip or len(names) not in (2, 3):
             raise LightsError(f"--lights gpio:{place}: {FORM}")
         chip = f"gpiochip{chip}" if chip.isdecimal() else chip
         self._chip = chip if "/" in chip else f"/dev/{chip}"
-        self._laser, self._led = Line.of(names[0]), Line.of(names[1])
-        if self._laser.place == self._led.place:
-            raise LightsError(f"--lights gpio:{place}: laser and LEDs on one line; {FORM}")
+        self._laser, self._led, *sync = self._lines = [Line.of(name) for name in names]
+        if len({line.place for line in self._lines}) < len(names):
+            raise LightsError(f"--lights gpio:{place}: two of them on one line; {FORM}")
+        self._sync = sync[0] if sync else None
+        self._edges: LineRequest | None = None
         self._longest_s = longest_s
         self._gpiod = _library()
         self._closed = False
@@ -80,10 +85,7 @@ class GpioLights(Lights):
         """Set both lines; lines that were lost are requested again first."""
         if self._closed:
             return
-        if self._request is None:
-            self._request = self._requested()
-            self._reopened += 1
-        value, request = self._gpiod.line.Value, self._request
+        value, request = self._gpiod.line.Value, self._reached()
         lights = {self._laser.place: Illumination.LASER, self._led.place: Illumination.LED}
         wanted = {place: value.ACTIVE if lit is one else value.INACTIVE for place, one in lights.items()}
         if lit in lights.values():
@@ -101,6 +103,20 @@ class GpioLights(Lights):
             )
         if lit not in lights.values():
             self._notify_watchdog(DARK)
+
+    def exposure_starts(self) -> list[int] | None:
+        """As the kernel stamped the edges of SYNC [ns]; None: there is no such line."""
+        if self._sync is None:
+            return None
+        found: list[int] = []
+        self._reached()
+        try:
+            while self._edges is not None and self._edges.wait_edge_events(0.0):
+                found += [event.timestamp_ns for event in self._edges.read_edge_events()]
+        except OSError as error:
+            self._lose()
+            raise LightsError(f"{self._chip}: lost: {error.strerror or error}") from error
+        return found
 
     def close(self) -> None:
         """Dark, and the lines given back."""
@@ -130,16 +146,24 @@ class GpioLights(Lights):
             ) from error
 
     def _lose(self) -> None:
-        request, watchdog = self._request, self._watchdog
-        self._request = self._watchdog = None
-        if request is not None:
-            request.release()
+        requests, watchdog = (self._request, self._edges), self._watchdog
+        self._request = self._edges = self._watchdog = None
+        for request in requests:
+            if request is not None:
+                request.release()
         if watchdog is not None:
             try:
                 watchdog.communicate(timeout=WATCHDOG_S)  # ends its input, and waits: then the lines are free
             except subprocess.TimeoutExpired:
                 watchdog.kill()
                 watchdog.wait()
+
+    def _reached(self) -> "LineRequest":
+        """The lines; those that were lost are requested again."""
+        if self._request is None:
+            self._request = self._requested()
+            self._reopened += 1
+        return self._request
 
     def _requested(self) -> "LineRequest":
         settings, line = self._gpiod.LineSettings, self._gpiod.line
@@ -157,6 +181,11 @@ class GpioLights(Lights):
         except (OSError, ValueError) as error:
             raise LightsError(self._why(error)) from error
         try:
+            self._edges = self._requested_edges()
+        except (OSError, ValueError) as error:
+            request.release()
+            raise LightsError(self._why(error)) from error
+        try:
             watchdog = subprocess.Popen(
                 [sys.executable, "-I", str(WATCHDOG), str(request.fd), str(self._longest_s)],
                 stdin=subprocess.PIPE,
@@ -165,16 +194,34 @@ class GpioLights(Lights):
                 start_new_session=True,
             )
         except OSError as error:
-            request.release()
+            self._request = request
+            self._lose()
             raise LightsError(f"{self._chip}: no second process can be started: {error.strerror}") from error
         assert watchdog.stdin is not None
         os.set_blocking(watchdog.stdin.fileno(), False)  # nobody waits for it while a light is on
         self._watchdog = watchdog
         return request
 
+    def _requested_edges(self) -> "LineRequest | None":
+        """The line that the camera sets, in a request that the watchdog does not have."""
+        if self._sync is None:
+            return None
+        line, kept = self._gpiod.line, 64  # edges that the kernel keeps: half a second
+        settings = self._gpiod.LineSettings(
+            direction=line.Direction.INPUT,
+            edge_detection=line.Edge.RISING,
+            active_low=self._sync.active_low,
+            event_clock=line.Clock.MONOTONIC,
+        )
+        config = {self._sync.place: settings}
+        edges: LineRequest = self._gpiod.request_lines(
+            self._chip, config=config, consumer=CONSUMER, event_buffer_size=kept
+        )
+        return edges
+
     def _why(self, error: OSError | ValueError) -> str:
         """What a user can do about a request that failed."""
-        lines = f"{self._laser.place}, {self._led.place}"
+        lines = ", ".join(str(line.place) for line in self._lines)
         code = error.errno if isinstance(error, OSError) else None
         if code == errno.ENOENT and "line" not in str(error).lower():
             return f"{self._chip}: no such GPIO chip; `gpiodetect` lists them"
@@ -191,7 +238,7 @@ class GpioLights(Lights):
     def _users(self) -> str:
         try:
             with self._gpiod.Chip(self._chip) as chip:
-                infos = [chip.get_line_info(one.place) for one in (self._laser, self._led)]
+                infos = [chip.get_line_info(one.place) for one in self._lines]
         except OSError:
             return "somebody"
         found = [f"{info.consumer or 'the kernel'} ({info.offset})" for info in infos if info.used]

@@ -41,6 +41,10 @@ class Lights(ABC):
         """Have nothing on, now. As `switch`."""
         self.switch(Illumination.AMBIENT)
 
+    def exposure_starts(self) -> list[int] | None:
+        """Starts of exposures since the last call [ns], by a line; None: there is none."""
+        return None
+
     @abstractmethod
     def close(self) -> None:
         """Leave it dark and give the device back. Safe to call twice."""
@@ -131,6 +135,11 @@ class Interlock:
             self._thread.join()
         self._lights.close()
         atexit.unregister(self._lights.close)
+
+    def exposure_starts(self) -> list[int] | None:
+        """As of the driver."""
+        with self._changed:
+            return self._lights.exposure_starts()
 
     def events(self) -> dict[str, int]:
         """Of the guard and of the driver."""

@@ -7,12 +7,13 @@ import zlib
 import pytest
 
 from tests.hosts.deployment import Deployment, streams
-from tests.hosts.fleet import MASTER_PORT
+from tests.hosts.fleet import MASTER_PORT, Fleet
 from tests.hosts.host import Host
 from tests.hosts.measured import Measured, strain
-from tests.hosts.rig import BUS_PORT, Rig
+from tests.hosts.rig import BUS_PORT, ROOT, Rig
 from tests.hosts.tap import MAGIC, TCP, UDP, captured
 
+UNIT = ROOT / "slave/install/files/phalanx-slave@.service"
 CAPTURE_S = 5.0
 FIRST_DYNAMIC, LAST_DYNAMIC = 61184, 65519  # users of DynamicUser=, systemd's UIDS-GIDS.md
 READABLE = (
@@ -102,6 +103,46 @@ def test_frames_are_for_root_and_group_video_of_the_machine_while_it_tracks(host
     assert host.restarts() == restarts
     host.run(f"systemctl restart {host.unit}")
     host.run(f"test -S /run/phalanx/{host.name}/frames")
+
+
+# The unit with another program, which needs no keys and no groups: it asks for what the strobe asks for.
+PROBE = """[Service]
+Type=oneshot
+WatchdogSec=0
+Restart=no
+EnvironmentFile=
+LoadCredential=
+SupplementaryGroups=
+ExecStopPost=
+ExecStart=
+ExecStart=/usr/bin/python3 -c 'import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))'
+"""
+
+
+# With the right to it, the unit's filter of system calls alone forbids it; without, LimitRTPRIO= has to allow it, too.
+CAPABLE = "CapabilityBoundingSet=CAP_SYS_NICE\nAmbientCapabilities=CAP_SYS_NICE\n"
+
+
+@pytest.mark.parametrize("rights", ["", CAPABLE], ids=["none", "CAP_SYS_NICE"])
+def test_real_time_is_refused_by_the_unit_and_allowed_by_strobe_conf(fleet: Fleet, rights: str) -> None:
+    host, folder = fleet.hosts["left"], "/etc/systemd/system"
+
+    def write(place: str, text: str) -> None:
+        host.run(f"mkdir -p {folder}/probe@1.service.d && cat > {folder}/{place} <<'END'\n{text}\nEND")
+
+    write("probe@.service", UNIT.read_text())
+    write("probe@1.service.d/probe.conf", PROBE + rights)
+    start = "systemctl daemon-reload && systemctl start probe@1.service"
+    try:
+        assert host.try_run(start).returncode != 0
+        log = host.run("journalctl -u probe@1.service -o cat --no-pager")
+        assert "PermissionError: [Errno 1] Operation not permitted" in log
+        write("probe@1.service.d/strobe.conf", (UNIT.parent / "strobe.conf").read_text())
+        if not rights and host.try_run("prlimit --rtprio=10 true").returncode != 0:
+            pytest.skip("the second half: RLIMIT_RTPRIO cannot be raised here, no CAP_SYS_RESOURCE")
+        host.run(start)
+    finally:
+        host.run(f"rm -r {folder}/probe@* && systemctl daemon-reload")
 
 
 def test_a_service_like_it_is_exposed_little(host: Host, measured: Measured) -> None:

@@ -46,6 +46,11 @@ class NotedLights(Lights):
         self.clock, self.takes_ns = clock, takes_ns
         self.fails = self.closed = False
         self.switched: list[tuple[int, Illumination]] = []
+        self.starts: list[int] | None = None  # that the camera's line showed since it was asked last
+
+    def exposure_starts(self) -> list[int] | None:
+        found, self.starts = self.starts, self.starts and []
+        return found
 
     def switch(self, lit: Illumination) -> None:
         if self.fails:

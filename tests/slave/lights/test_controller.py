@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from common.recording.frame_recording import Illumination
-from slave.lights.controller import CYCLE, FAILED_NS, LEAST, Strobe, StrobeSchedule
+from slave.lights.controller import AHEAD, CYCLE, FAILED_NS, LEAST, Strobe, StrobeSchedule
 from slave.lights.interlock import WINDOW_NS, Interlock
 from tests.slave.lights.stage import (
     AMBIENT,
@@ -35,12 +35,19 @@ class Stage:
         self.strobe = Strobe(StrobeSchedule(90.0, 2000.0, 1000.0), self.interlock, self.clock)
         self.late = late
 
-    def run(self, frames: range, jitter_ns: float = 0.0, seed: int = 0, lost: float = 0.0) -> None:
-        """Let these frames be taken; each is pushed when it arrives, and the strobe stepped when it asked for it."""
+    def run(
+        self, frames: range, jitter_ns: float = 0.0, seed: int = 0, lost: float = 0.0, shown: bool = False
+    ) -> None:
+        """Let these frames be taken; each is pushed when it arrives, and the strobe stepped when it asked for it.
+
+        `shown`: the camera shows each exposure on a line of its own, which no frame loses.
+        """
         rng = np.random.default_rng(seed)
         again = self.strobe.step()
         for k in frames:
             again = self._until(stamp(k) + HANDED_OVER_NS, again)
+            if shown:
+                self.lights.starts = [*(self.lights.starts or []), exposures(k)[0]]
             if rng.random() >= lost:
                 self.strobe.push(k, stamp(k, jitter_ns, rng))
                 again = self.strobe.step()
@@ -65,7 +72,7 @@ def test_every_frame_is_lit_as_the_cycle_says() -> None:
     stage = Stage()
     stage.run(range(60))
     assert [stage.kind(k) for k in range(20, 58)] == [CYCLE[k % 3] for k in range(20, 58)]
-    assert stage.strobe.missed == {"skipped": 0, "late": 0}
+    assert stage.strobe.missed == {"skipped": 0, "late": 0, "no_sync": 0}
     assert stage.interlock.counts["refused"] == 0
 
 
@@ -74,6 +81,31 @@ def test_jitter_and_lost_frames_change_nothing(seed: int) -> None:
     stage = Stage(takes_ns=300_000)
     stage.run(range(300), jitter_ns=50_000.0, seed=seed, lost=0.2)
     assert [stage.kind(k) for k in range(60, 298)] == [CYCLE[k % 3] for k in range(60, 298)]
+
+
+def test_exposures_that_the_cameras_line_shows_take_the_place_of_stamps() -> None:
+    stamped, shown = Stage(), Stage()
+    for stage in (stamped, shown):
+        stage.lights.starts = [] if stage is shown else None
+        # Stamps scatter by a fifth of a period, frames are lost: nothing can be predicted by them
+        stage.run(range(200), jitter_ns=2.2e6, seed=3, lost=0.3, shown=stage is shown)
+    illuminations = [shown.kind(k) for k in range(60, 198)]
+    assert illuminations in [[CYCLE[(k + first) % 3] for k in range(60, 198)] for first in range(3)]
+    assert shown.strobe.missed["no_sync"] == 0
+    assert sum(stamped.kind(k) is not AMBIENT for k in range(60, 198)) < 20
+
+
+def test_a_line_that_shows_nothing_is_counted_and_nothing_is_lit() -> None:
+    stage = Stage()
+    stage.run(range(40), shown=True)
+    assert stage.lights.pulses()
+    seen = len(stage.lights.pulses())
+    stage.run(range(40, 100))  # frames come, and the wire is off
+    assert stage.strobe.missed["no_sync"] == 60 - AHEAD
+    assert len(stage.lights.pulses()) < seen + AHEAD
+    assert stage.lights.lit is AMBIENT
+    stage.run(range(100, 140), shown=True)
+    assert stage.kind(135) is CYCLE[135 % 3]
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -43,6 +43,7 @@ class FakeGpio:
         self.gone = False
         self.stuck: set[int] = set()
         self.requests: list[FakeRequest] = []
+        self.edges: list[int] = []  # times of what happened on the input line
 
     def request_lines(
         self, path: str, config: Mapping[Any, Any], consumer: str | None = None, **_: Any
@@ -54,6 +55,8 @@ class FakeGpio:
         if self.fails is not None:
             raise OSError(self.fails, os.strerror(self.fails))
         lines = {place: self.offset(place) for place in config}
+        if all(settings.direction is gpiod.line.Direction.INPUT for settings in config.values()):
+            return FakeEdges(self, lines, config)  # type: ignore[return-value]
         if any(offset in self.users for offset in lines.values()):
             raise OSError(errno.EBUSY, "Device or resource busy")
         self.users |= dict.fromkeys(lines.values(), consumer or "")
@@ -107,6 +110,30 @@ class FakeRequest:
             raise OSError(errno.ENODEV, "No such device")
 
 
+class FakeEdges:
+    """One line as an input; the kernel keeps what happens on it, with its time."""
+
+    def __init__(self, kernel: FakeGpio, lines: dict[Any, int], config: Mapping[Any, Any]) -> None:
+        (self.offset,), (self.settings,) = lines.values(), config.values()
+        self.kernel, self.released = kernel, False
+        self.kernel.users[self.offset] = CONSUMER
+
+    def wait_edge_events(self, timeout: float | None = None) -> bool:
+        assert not self.released
+        assert timeout == 0.0  # nobody waits for it
+        if self.kernel.gone:
+            raise OSError(errno.ENODEV, "No such device")
+        return bool(self.kernel.edges)
+
+    def read_edge_events(self) -> list[SimpleNamespace]:
+        found, self.kernel.edges = self.kernel.edges[:16], self.kernel.edges[16:]  # as many as a call returns
+        return [SimpleNamespace(timestamp_ns=t_ns) for t_ns in found]
+
+    def release(self) -> None:
+        self.released = True
+        self.kernel.users.pop(self.offset, None)
+
+
 @pytest.fixture
 def kernel(monkeypatch: pytest.MonkeyPatch) -> FakeGpio:
     fake = FakeGpio()
@@ -137,6 +164,11 @@ def test_the_stand_in_takes_what_the_library_takes() -> None:
     assert set(inspect.signature(FakeGpio.request_lines).parameters) - {"self", "_"} <= set(real)
     methods = vars(gpiod.LineRequest)
     assert {"set_values", "get_values", "release"} <= set(methods)
+    assert {"wait_edge_events", "read_edge_events"} <= set(methods)
+    settings = inspect.signature(gpiod.LineSettings).parameters
+    assert {"edge_detection", "event_clock", "active_low"} <= set(settings)
+    assert "event_buffer_size" in real
+    assert hasattr(gpiod.EdgeEvent, "timestamp_ns") or "timestamp_ns" in gpiod.EdgeEvent.__dataclass_fields__
 
 
 @pytest.mark.parametrize("chip", ["0", "gpiochip0", "/dev/gpiochip0"])
@@ -172,6 +204,36 @@ def test_one_light_at_a_time_and_dark_at_both_ends(
     assert kernel.users == {}
     lights.switch(LASER)
     assert lit() == (False, False)
+
+
+@pytest.mark.parametrize("low", [False, True])
+def test_the_kernels_stamps_of_the_cameras_line_are_read(kernel: FakeGpio, low: bool) -> None:
+    assert GpioLights("0:5,6", LONGEST_S).exposure_starts() is None
+    lights = GpioLights(f"0:17,27,22{'/low' if low else ''}", LONGEST_S)
+    assert lights.exposure_starts() == []
+    kernel.edges = list(range(1000, 1040))
+    assert lights.exposure_starts() == list(range(1000, 1040))
+    assert lights.exposure_starts() == []
+    edges = lights._edges
+    assert isinstance(edges, FakeEdges)
+    assert (edges.settings.edge_detection, edges.settings.event_clock, edges.settings.active_low) == (
+        gpiod.line.Edge.RISING,
+        gpiod.line.Clock.MONOTONIC,
+        low,
+    )
+    kernel.gone = True
+    for _ in range(2):
+        with pytest.raises(LightsError, match="/dev/gpiochip0"):
+            lights.exposure_starts()
+    kernel.gone, kernel.edges = (
+        False,
+        [5],
+    )  # nothing is lit without stamps: the line itself is what comes back first
+    assert lights.exposure_starts() == [5]
+    assert lights.counts() == {"reopened": 1}
+    lights.close()
+    assert edges.released
+    assert set(kernel.users) == {5, 6}
 
 
 def test_a_chip_that_is_unplugged_comes_back(kernel: FakeGpio) -> None:
@@ -246,7 +308,10 @@ def test_a_line_that_does_not_follow_is_said(kernel: FakeGpio) -> None:
         ("0:17", None, "write gpio:CHIP:LASER,LED"),
         ("17,27", None, "write gpio:CHIP:LASER,LED"),
         ("0:17,27/up", None, "line '27/up'"),
-        ("0:17,17/low", None, "laser and LEDs on one line"),
+        ("0:17,17/low", None, "two of them on one line"),
+        ("0:17,27,27", None, "two of them on one line"),
+        ("0:17,27,99", None, "line 17, 27, 99: cannot be requested"),
+        ("0:17,27,22,23", None, "write gpio:CHIP:LASER,LED"),
         ("0:,27", None, "line ''"),
     ],
 )
