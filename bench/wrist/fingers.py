@@ -49,7 +49,7 @@ class Found:
     @classmethod
     def of(cls, seen: Seen, level: Literal["fk", "ik", "auto"] = "auto", *, cubic: bool = False) -> Self:
         """Solve, each pose by itself."""
-        line = WristPipeline(replace(seen.setup, level=level, cubic=cubic), continuous=False)
+        line = WristPipeline(replace(seen.setup, solver_mode=level, cubic=cubic), continuous=False)
         poses = [one.pose for message in seen.messages for one in line.push(message)]
         off = np.array([pose.angles_rad for pose in poses]) - seen.truth_rad
         tracked = np.array([pose.tracked[CHAINS[:, 2]] for pose in poses])
