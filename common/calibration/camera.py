@@ -1,10 +1,11 @@
 """Typed files of cameras: mode, exposure, optics and the colours of the markers."""
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from common.calibration.files import Part, Provenance
+from common.calibration.files import Part, Provenance, read_json
 from common.errors import CalibrationError
 from common.geometry.lens import Lens, fold_of
 from common.messages import Name
@@ -22,6 +23,8 @@ ColourGain = Annotated[float, Meta(ge=0.01, le=100.0)]  # libcamera allows 32
 RowTime = Annotated[float, Meta(ge=0.0, le=1e5)]  # [us] 16 rows of a picture that is read in 1.6 s
 Focus = Annotated[float, Meta(ge=1e-3, le=1e6)]  # [m] from a macro lens to infinity
 Size = Annotated[int, Meta(ge=16, le=16384)]  # [px] from a thermal array to 150 megapixels
+Offset = Annotated[int, Meta(ge=0, le=16384)]  # [px] on a pixel array
+ViewAngle = Annotated[float, Meta(ge=0.06, le=170.0)]  # [deg]
 Pixel = Annotated[float, Meta(ge=-0.5, le=16384.0)]  # of a picture
 Focal = Annotated[float, Meta(ge=1.0, le=1e7)]  # [px] check_camera compares it with the picture, too
 Principal = Annotated[float, Meta(ge=-32768.0, le=32768.0)]  # [px]
@@ -39,6 +42,48 @@ class Intrinsics(Part, frozen=True):
     cx_px: Principal
     cy_px: Principal
     distortion: tuple[Radial, Radial, Tangential, Tangential, Radial] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class Sensor(Part, frozen=True):
+    """What is known of sensor and lens before anything is measured.
+
+    Attributes:
+        title: What it is sold as.
+        model: Its name in `rpicam-hello --list-cameras`; of a USB camera its class.
+        driver: What opens it.
+        shutter: Rolling with a `row_time_us` of 0: not known.
+        colours: Whether it has colour filters.
+        mode_px: Width and height of what the sensor delivers; the picture is scaled from it.
+        bits: Of the mode; 0: the camera's own business.
+        max_rate_hz: Highest rate of the mode.
+        crop_px: What the picture shows of the pixel array: x, y, width, height.
+        view_deg: Angle of the picture, across and down, by the lens `nominal`.
+        nominal: Lens of focal length and pixel pitch, no measurement: `intrinsics` of the file are absent beside it.
+        focal_share: Standard deviation of its focal length, as a share.
+        exposure_us: Shortest and longest exposure at the rate of this file.
+        sync: How two of them are exposed together.
+        sources: Fact -> where it is from.
+    """
+
+    title: str
+    model: Name
+    driver: Literal["picamera2", "v4l2"]
+    shutter: Literal["rolling", "global"]
+    colours: bool
+    mode_px: tuple[Size, Size]
+    bits: Annotated[int, Meta(ge=0, le=16)]
+    max_rate_hz: FrameRate
+    crop_px: tuple[Offset, Offset, Size, Size]
+    view_deg: tuple[ViewAngle, ViewAngle]
+    nominal: Intrinsics
+    focal_share: Annotated[float, Meta(ge=0.001, le=1.0)]
+    exposure_us: tuple[Exposure, Exposure]
+    sync: str
+    sources: dict[str, str]
+
+    def fits(self, model: str) -> bool:
+        """Whether `model` is one of these, with or without infrared filter."""
+        return model.removesuffix("_noir") == self.model
 
 
 class HsvRange(Part, frozen=True):
@@ -73,6 +118,7 @@ class CameraCalibration(Part, frozen=True):
     intrinsics: Intrinsics | None = None
     markers: dict[Name, HsvRange] | None = None
     roi_margin: RoiMargin = 0.0625
+    sensor: Sensor | None = None
     provenance: dict[str, Provenance] = {}
 
 
@@ -80,6 +126,12 @@ def check_camera(camera: CameraCalibration, where: str) -> None:
     """Refuse an empty colour range, and what `check_lens` refuses (CalibrationError)."""
     if camera.intrinsics is not None:
         check_lens(camera.intrinsics, (camera.width_px, camera.height_px), where)
+    if camera.sensor is not None:
+        check_lens(camera.sensor.nominal, (camera.width_px, camera.height_px), f"{where}: sensor")
+        if camera.sensor.shutter == "global" and camera.row_time_us:
+            raise CalibrationError(
+                f"{where}: row_time_us: {camera.row_time_us:g}, of a global shutter it is 0"
+            )
     for name, colour in (camera.markers or {}).items():
         for i, letter in ((1, "S"), (2, "V")):
             if colour.hsv_low[i] > colour.hsv_high[i]:
@@ -118,3 +170,11 @@ def check_lens(lens: Intrinsics, size_px: tuple[int, int], where: str) -> None:
             f" the picture, at pixel ({fold.u:.0f}, {fold.v:.0f}): the distortion is not monotone there, and no ray"
             " belongs to a pixel beyond; calibrate with views that reach the corners of the picture"
         )
+
+
+def sensor_files(tree: Path) -> dict[str, CameraCalibration]:
+    """Sensor files of a calib_json tree: cameras/MODEL-WIDTHxHEIGHT*.json."""
+    paths = sorted((tree / "cameras").glob("*-*x*.json"))
+    return {
+        path.stem: file for path in paths if (file := read_json(path, CameraCalibration)).sensor is not None
+    }

@@ -29,7 +29,13 @@ from slave.cameras.picamera2_settings import (
     read_figures,
     wanted_settings,
 )
-from slave.cameras.picamera2_streams import Streams, choose_mode, choose_raw_mode, read_modes
+from slave.cameras.picamera2_streams import (
+    Streams,
+    check_model,
+    choose_mode,
+    choose_raw_mode,
+    read_modes,
+)
 from slave.cameras.picamera2_timing import SyncMonitor, Timeline, wait_in_step
 from slave.cameras.settings import FrameObserver, as_values, change, demand, differences
 from slave.sources import Frame, Tunable
@@ -193,8 +199,12 @@ class Picamera2Camera(Tunable):
         need_hz = camera.frame_rate_hz * (1.0 if self._options.sync == "off" else 1.05)
         try:
             modes = read_modes(library.sensor_modes)
-            choose = choose_raw_mode if self._options.pixels is Pixels.GREY else choose_mode
-            mode = choose(modes, need_hz, size)
+            model = str(library.camera_properties.get("Model", "unknown model"))
+            check_model(camera.sensor, model, modes, need_hz)
+            if self._options.pixels is Pixels.GREY:
+                mode = choose_raw_mode(modes, need_hz, size)
+            else:
+                mode = choose_mode(modes, need_hz, size, camera.sensor)
             asked = controls(camera, self._options, self._enums, library.camera_controls)
             streams = Streams(self._options.pixels, size, mode, self._options.lores)
             library.configure(
@@ -207,7 +217,6 @@ class Picamera2Camera(Tunable):
             raise CameraError(f"{self._where}: {error}") from error
         except (RuntimeError, ValueError) as error:
             raise CameraError(f"{self._where}: cannot be started: {error}") from error
-        model = library.camera_properties.get("Model", "unknown model")
         _LOG.info("%s: %s, mode %s", self._where, model, mode.text(modes))
 
     def _settle(self, camera: CameraCalibration, frames: Iterable[Mapping[str, object]]) -> None:

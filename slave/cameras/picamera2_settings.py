@@ -9,8 +9,8 @@ programs the analogue gain in codes of the sensor: OV5647 has steps of 1/16, IMX
 steps of gain² / 256, the others are finer (libcamera, src/ipa/rpi/cam_helper). What rounding takes away it gives back
 as digital gain behind the sensor, which may therefore exceed 1 by as much, and not by more. Colour gains come back as
 they were written, but for the fixed point of the image processor. A lens moves in steps of about 0.03 dioptres
-(IMX708: 480 steps for 15 dioptres). What cannot be used, is out of range or missing raises `CameraError`, which
-states what to do.
+(IMX708: 480 steps for 15 dioptres). The view may be off by a hundredth: image processors round it. What cannot be
+used, is out of range or missing raises `CameraError`, which states what to do.
 """
 
 import importlib
@@ -257,6 +257,11 @@ def wanted_settings(
     ]
     if pixels is Pixels.COLOUR or "ColourGains" in available:
         wanted.append(Setting("ColourGains", camera.colour_gains, 0.01, "", "colour_gains"))
+    if camera.sensor is not None and pixels is not Pixels.GREY and "ScalerCrop" in available:
+        crop = camera.sensor.crop_px
+        wanted.append(
+            Setting("ScalerCrop", tuple(map(float, crop)), 0.01 * crop[2], "px", "sensor.crop_px: the view")
+        )
     if "AfMode" in available and camera.focus_m is not None:
         wanted.append(Setting("LensPosition", (1.0 / camera.focus_m,), 0.05, "dioptres", "focus_m"))
     return tuple(wanted)

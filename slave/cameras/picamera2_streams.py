@@ -21,17 +21,14 @@ import numpy as np
 import numpy.typing as npt
 
 from common.arrays import Image
+from common.calibration.camera import Sensor
 from common.errors import CameraError
 from slave.cameras.grey import Pixels, grey, luma
 from slave.cameras.picamera2_settings import Request
+from slave.cameras.settings import how_far
 
 # libcamera's R8, R10_CSI2P, MONO_PISP_COMP1; mosaics are SRGGB10, RGGB_PISP_COMP1 and so on.
 MONO = re.compile(r"R\d|MONO")
-FACTS = (
-    "Known cameras: Camera v1 (OV5647) 58.9 Hz at 640x480 with the full view; v2 (IMX219) 41.9 Hz with the full view, "
-    "206 Hz only from a centre crop of 26 degrees; v3 (IMX708) 56 Hz with the full view, 120 Hz at 1536x864 from two "
-    "thirds of it; Global Shutter (IMX296) 60 Hz with the full view"
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,10 +72,21 @@ def read_modes(modes: Sequence[Mapping[str, Any]]) -> tuple[SensorMode, ...]:
     )
 
 
-def choose_mode(modes: Sequence[SensorMode], rate_hz: float, size: tuple[int, int]) -> SensorMode:
-    """Mode with the widest view among those fast enough and not smaller than `size`.
+def check_model(sensor: Sensor | None, model: str, modes: Sequence[SensorMode], rate_hz: float) -> None:
+    """Refuse a camera file of another sensor."""
+    if sensor is not None and not sensor.fits(model):
+        raise CameraError(
+            f"the camera file is one of {sensor.model} ({sensor.title}), the camera is {model}. Nearest modes: "
+            f"{listed(modes, sensor.mode_px, rate_hz)}. `phalanx-slave doctor` names the files that fit"
+        )
 
-    Of modes with the same view the one with the fewest pixels is taken (binned: less noise, less to read out), then
+
+def choose_mode(
+    modes: Sequence[SensorMode], rate_hz: float, size: tuple[int, int], sensor: Sensor | None = None
+) -> SensorMode:
+    """Mode of `sensor`; of an unknown one that with the widest view.
+
+    It is fast enough and not smaller than `size`. Of modes with the same view the one with the fewest pixels is taken (binned: less noise, less to read out), then
     the one with the most bits.
     """
     if not modes:
@@ -87,10 +95,15 @@ def choose_mode(modes: Sequence[SensorMode], rate_hz: float, size: tuple[int, in
         )
     width, height = size
     able = [m for m in modes if m.reaches(rate_hz) and m.size[0] >= width and m.size[1] >= height]
+    wanted = f"{width}x{height} at {rate_hz:g} Hz"
+    if sensor is not None:
+        able = [m for m in able if (m.size, m.bit_depth) == (sensor.mode_px, sensor.bits)]
+        wanted += f" from {sensor.mode_px[0]}x{sensor.mode_px[1]} {sensor.bits} bit"
     if not able:
         raise CameraError(
-            f"no mode of the camera delivers {width}x{height} at {rate_hz:g} Hz. It has: {_listed(modes)}. Lower "
-            f"frame_rate_hz, width_px or height_px in the camera file, or use another camera. {FACTS}"
+            f"no mode of the camera delivers {wanted}. Nearest: "
+            f"{listed(modes, size if sensor is None else sensor.mode_px, rate_hz)}. Change frame_rate_hz, width_px, "
+            "height_px of the camera file; `phalanx-slave doctor` names the shipped files that fit"
         )
     return min(_widest(able), key=lambda mode: (mode.size[0] * mode.size[1], -mode.bit_depth))
 
@@ -101,8 +114,10 @@ def _widest(modes: Sequence[SensorMode]) -> list[SensorMode]:
     return [mode for mode in modes if mode.area >= 0.98 * view]
 
 
-def _listed(modes: Sequence[SensorMode]) -> str:
-    return "; ".join(mode.text(modes) for mode in modes) or "none"
+def listed(modes: Sequence[SensorMode], size: tuple[int, int], rate_hz: float) -> str:
+    """Modes in words, those nearest to a size [px] and rate [Hz] first."""
+    near = sorted(modes, key=lambda mode: how_far(size, rate_hz, mode.size, (max(mode.rate_hz, rate_hz),)))
+    return "; ".join(mode.text(modes) for mode in near) or "none"
 
 
 def choose_raw_mode(modes: Sequence[SensorMode], rate_hz: float, size: tuple[int, int]) -> SensorMode:
@@ -119,9 +134,9 @@ def choose_raw_mode(modes: Sequence[SensorMode], rate_hz: float, size: tuple[int
     able = [m for m in modes if m.mono and m.size == size and m.reaches(rate_hz) and m.bit_depth >= 8]
     if not able:
         raise CameraError(
-            f"no mode of the sensor is {size[0]}x{size[1]} at {rate_hz:g} Hz. It has: {_listed(modes)}. A grey image "
-            "is what the sensor delivers, pixel by pixel: set width_px, height_px, frame_rate_hz of the camera file to "
-            "a mode"
+            f"no mode of the sensor is {size[0]}x{size[1]} at {rate_hz:g} Hz. Nearest: "
+            f"{listed(modes, size, rate_hz)}. A grey image is what the sensor delivers, pixel by pixel: set width_px, "
+            "height_px, frame_rate_hz of the camera file to a mode"
         )
     return min(_widest(able), key=lambda mode: mode.bit_depth)
 

@@ -6,6 +6,7 @@ what to do. What changes settings of a running camera watches its frames go by (
 up.
 """
 
+import math
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -63,6 +64,14 @@ def demand(where: str, wanted: Iterable[Setting], got: Mapping[str, object], fix
     found = differences(wanted, got)
     if found:
         raise CameraError(f"{where} did not take its settings: {'; '.join(found)}. {fix}")
+
+
+def how_far(
+    size: tuple[int, int], rate_hz: float, offered: tuple[int, int], rates_hz: Sequence[float]
+) -> tuple[float, float]:
+    """Distance of an offer from what is wanted: by size [px], then by rate [Hz]."""
+    sides = sum(abs(math.log(a / b)) for a, b in zip(size, offered, strict=True))
+    return sides, min((abs(math.log(one / rate_hz)) for one in rates_hz), default=0.0)
 
 
 def change(

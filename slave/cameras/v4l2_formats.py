@@ -19,6 +19,7 @@ from common.errors import CameraError, PictureError
 from common.recording.pictures import decode
 from slave.cameras import v4l2_abi as abi
 from slave.cameras.grey import GREY_FORMATS, JPEG_FORMATS, LUMA_FORMATS, Pixels, grey, luma, rows_of
+from slave.cameras.settings import how_far
 
 PREFERENCE = {
     Pixels.COLOUR: ("BGR3", "RGB3", "YUYV", "UYVY", *JPEG_FORMATS),
@@ -80,13 +81,16 @@ def choose_offer(
     wanted = [abi.fourcc(name) for name in PREFERENCE[pixels]]
     able = [o for o in offers if o.pixel_format in wanted and o.size == size and o.reaches(rate_hz)]
     if not able:
-        listed = "; ".join(offer.text() for offer in offers if offer.pixel_format in wanted) or "nothing"
-        known = ", ".join(PREFERENCE[pixels])
+        read = [offer for offer in offers if offer.pixel_format in wanted]
+        read.sort(key=lambda offer: how_far(size, rate_hz, offer.size, offer.rates_hz))
+        most = 6  # in an error: a webcam offers some forty
+        listed = "; ".join(offer.text() for offer in read[:most]) or "nothing"
         foreign = sorted({abi.fourcc_text(o.pixel_format) for o in offers if o.pixel_format not in wanted})
         unread = f" (and {', '.join(foreign)}, {_WHY_NOT[pixels]})" if foreign else ""
         raise CameraError(
-            f"does not offer {size[0]}x{size[1]} at {rate_hz:g} Hz in a known format ({known}). It offers: "
-            f"{listed}{unread}. Set width_px, height_px and frame_rate_hz of the camera file to one of these"
+            f"does not offer {size[0]}x{size[1]} at {rate_hz:g} Hz in a known format "
+            f"({', '.join(PREFERENCE[pixels])}). Nearest of {len(read)}: {listed}{unread}. "
+            "Set width_px, height_px and frame_rate_hz of the camera file to one of these"
         )
     return min(able, key=lambda offer: wanted.index(offer.pixel_format))
 

@@ -19,56 +19,9 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
+from tests.slave.recorded_lists import OV5647, Mode, Recorded
+
 STRIDE = 64
-Mode = dict[str, Any]
-
-
-def mode(
-    size: tuple[int, int],
-    fps: float,
-    crop: tuple[int, int, int, int],
-    row_us: float,
-    raw: str = "SBGGR10_CSI2P",
-) -> Mode:
-    """One entry of `sensor_modes`."""
-    unpacked = raw.partition("_")[0]
-    return {
-        "format": raw,
-        "unpacked": unpacked,
-        "bit_depth": int(unpacked.lstrip("SRGB")),
-        "size": size,
-        "fps": fps,
-        "crop_limits": crop,
-        "exposure_limits": (math.ceil(row_us), 10_000_000, 20_000),
-        "_row_us": row_us,
-    }
-
-
-# As `rpicam-hello --list-cameras` prints them.
-IMX219 = (
-    mode((640, 480), 206.65, (1000, 752, 1280, 960), 8.9),
-    mode((1640, 1232), 41.85, (0, 0, 3280, 2464), 18.9),
-    mode((1920, 1080), 47.57, (680, 692, 1920, 1080), 18.9),
-    mode((3280, 2464), 21.19, (0, 0, 3280, 2464), 18.9),
-)
-OV5647 = (
-    mode((640, 480), 58.92, (16, 0, 2560, 1920), 33.6),
-    mode((1296, 972), 46.34, (0, 0, 2592, 1944), 21.6),
-    mode((1920, 1080), 32.81, (348, 434, 1928, 1080), 27.6),
-    mode((2592, 1944), 15.63, (0, 0, 2592, 1944), 32.5),
-)
-
-
-OV7251 = tuple(mode((640, 480), 120.0, (0, 0, 640, 480), 16.0, raw) for raw in ("R8", "R10_CSI2P"))
-OV9281 = tuple(
-    mode(size, fps, crop, 9.1, raw)
-    for raw in ("R8", "R10_CSI2P")
-    for size, fps, crop in (
-        ((640, 400), 260.42, (0, 0, 1280, 800)),
-        ((1280, 720), 144.4, (0, 40, 1280, 720)),
-        ((1280, 800), 120.76, (0, 0, 1280, 800)),
-    )
-)
 
 
 @dataclass
@@ -92,6 +45,7 @@ class Sensor:
     model: str = "ov5647"
     modes: tuple[Mode, ...] = OV5647
     gain_code: float = 1.0 / 16.0
+    gains: tuple[float, float] = (1.0, 63.9375)
     focus: bool = False
     monochrome: bool = False
     sync: bool = True
@@ -110,6 +64,17 @@ class Sensor:
     pi_5: bool = False
     start_ns: int = field(default_factory=lambda: time.monotonic_ns() - 4_500_000_000)
     opened: list["Picamera2"] = field(default_factory=list["Picamera2"])
+
+    @classmethod
+    def of(cls, listed: Recorded) -> "Sensor":
+        """The sensor of a recorded list."""
+        return cls(
+            model=listed.model,
+            modes=listed.modes,
+            gains=listed.gains,
+            focus=listed.focus,
+            monochrome=not listed.colours,
+        )
 
 
 class Picamera2:
@@ -162,7 +127,7 @@ class Picamera2:
         have: dict[str, tuple[Any, Any, Any]] = {
             "AeEnable": (False, True, True),
             "ExposureTime": (math.ceil(self._mode["_row_us"]), shortest * 100, 20_000),
-            "AnalogueGain": (1.0, 63.9375, 1.0),
+            "AnalogueGain": (*self._sensor.gains, 1.0),
             "FrameDurationLimits": (shortest, 10_000_000, 33_333),
             "NoiseReductionMode": (0, 4, 0),
             "ScalerCrop": ((0, 0, 64, 64), self._mode["crop_limits"], self._mode["crop_limits"]),
@@ -232,7 +197,11 @@ class Picamera2:
                 raise TypeError(f"Control {name} takes integers")
         size = config["sensor"].get("output_size", config["main"]["size"])
         self._mode = min(
-            self._sensor.modes, key=lambda m: abs(m["size"][0] - size[0]) + abs(m["size"][1] - size[1])
+            self._sensor.modes,
+            key=lambda m: (
+                abs(m["size"][0] - size[0]) + abs(m["size"][1] - size[1]),
+                abs(m["bit_depth"] - config["sensor"].get("bit_depth", m["bit_depth"])),
+            ),
         )
         for name in ("main", "lores"):
             if config[name] is not None:
@@ -317,7 +286,7 @@ class Picamera2:
             "AnalogueGain": gain,
             "DigitalGain": 1.0 if late else asked["ExposureTime"] * asked["AnalogueGain"] / (exposure * gain),
             "FrameDuration": int(period_us),
-            "ScalerCrop": self._mode["crop_limits"],
+            "ScalerCrop": self._view(),
         }
         if "ColourGains" in asked:
             found["ColourGains"] = tuple(float(np.float32(gain)) for gain in asked["ColourGains"])
@@ -327,6 +296,13 @@ class Picamera2:
             found |= self._sync_of(number, client=asked["SyncMode"] == 2)
         self._sensor.tamper(number, found)
         return found
+
+    def _view(self) -> tuple[int, int, int, int]:
+        """The largest middle part of the mode that has the shape of `main`, as libcamera takes it."""
+        x, y, width, height = self._mode["crop_limits"]
+        shape = self._config["main"]["size"][0] / self._config["main"]["size"][1]
+        wide, high = min(width, round(height * shape)), min(height, round(width / shape))
+        return x + (width - wide) // 2, y + (height - high) // 2, wide, high
 
     def _sync_of(self, number: int, client: bool) -> dict[str, Any]:
         ready_at = self._sensor.sync_ready_at

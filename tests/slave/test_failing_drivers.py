@@ -24,8 +24,9 @@ from slave.reconnect import CONTRAST, ReconnectingCamera, RepeatedPictures
 from slave.report import DetectionCounters
 from slave.sender import MarkerPipeline, WristPipeline, run
 from slave.sources import LOG_EVERY_NS, Failures, Frame, FrameSource
-from tests.slave.fake_picamera2 import OV7251, Sensor, install
+from tests.slave.fake_picamera2 import Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice
+from tests.slave.recorded_lists import OV7251
 from tests.slave.stand_ins import camera_file
 
 FILE = camera_file()

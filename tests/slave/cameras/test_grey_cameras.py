@@ -24,8 +24,9 @@ from slave.preview import small_jpeg, whole_jpeg
 from slave.report import DetectionCounters
 from slave.sender import WristPipeline, run
 from slave.wrist.detector import WristDetector
-from tests.slave.fake_picamera2 import OV7251, OV9281, Sensor, install
+from tests.slave.fake_picamera2 import Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice, colour, level, row_bytes, webcam_knobs
+from tests.slave.recorded_lists import OV7251, OV9281
 from tests.slave.stand_ins import Listed, Wire, camera_file
 from tests.slave.wrist.test_loop import NAMES
 from tests.slave.wrist.wrist_frames import ROOT, VIEW, strobed
@@ -212,7 +213,7 @@ def test_a_pi_camera_gives_what_its_sensor_measured(
 def test_a_pi_camera_has_exactly_a_mode_of_its_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
     sensor = Sensor(model="ov9281", modes=OV9281, monochrome=True)
     with pytest.raises(
-        CameraError, match=r"no mode of the sensor is 640x480 at 90 Hz.*640x400 8 bit, up to 260.4 Hz"
+        CameraError, match=r"no mode of the sensor is 640x480 at 90 Hz.*640x400 10 bit, up to 247.8 Hz"
     ):
         pi(monkeypatch, sensor)
     camera = pi(monkeypatch, sensor, height_px=400)

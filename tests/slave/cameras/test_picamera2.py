@@ -18,15 +18,8 @@ from common.errors import CameraError
 from slave.cameras.picamera2 import BUFFERS, Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
 from slave.cameras.picamera2_streams import choose_mode, read_modes, without_padding
-from tests.slave.fake_picamera2 import (
-    IMX219,
-    OV5647,
-    CompletedRequest,
-    Picamera2,
-    Sensor,
-    install,
-    parameters,
-)
+from tests.slave.fake_picamera2 import CompletedRequest, Picamera2, Sensor, install, parameters
+from tests.slave.recorded_lists import IMX219, OV5647
 from tests.slave.stand_ins import camera_file
 
 calibration = partial(camera_file, frame_rate_hz=50.0)
@@ -69,8 +62,8 @@ def test_a_frame_is_bgr_and_its_time_is_the_middle_of_the_exposure_of_row_zero(
     assert [frame.seq for frame in frames] == [0, 1, 2]
     assert tuple(frames[0].image[0, 0, :2]) == (200, 100), "blue, green"
     number = int(frames[0].image[0, 0, 2])  # the fake writes the frame's number into red
-    # SensorTimestamp is when row 0 is read out, at the end of its exposure: 148 rows of 33.6 us.
-    middle = sensor.start_ns + round(number * 595 * 33.6e3) - 4972 * 500
+    # SensorTimestamp is when row 0 is read out, at the end of its exposure: 148 rows of 33.67 us.
+    middle = sensor.start_ns + round(number * 594 * 33.67e3) - 4972 * 500
     assert abs(frames[0].t_ns - middle) < 100_000
     assert abs(frames[0].ready_t_ns - time.monotonic_ns()) < 10_000_000_000
     assert frames[0].image is not frames[1].image
@@ -87,7 +80,7 @@ def test_image_and_metadata_are_of_one_request_and_every_request_goes_back(
         frame = camera.read()
         assert frame is not None
         step = int(frame.image[0, 0, 2]) - int(first.image[0, 0, 2])
-        assert abs(frame.t_ns - first.t_ns - step * 19_992_000) < 50_000
+        assert abs(frame.t_ns - first.t_ns - step * 19_999_980) < 50_000
     assert sensor.opened[0].outstanding == 0
 
 
@@ -168,7 +161,7 @@ def test_settings_that_come_late_are_waited_for_and_ones_that_waver_are_refused(
         ({"exposure_us": 25_000.0}, "exposure_us 25000 does not fit into a frame of 20000 us"),
         ({"analogue_gain": 90.0}, "AnalogueGain 90 is not within 1 to 63.9375"),
         ({"exposure_us": 20.0}, "ExposureTime 20 is not within 34 to"),
-        ({"frame_rate_hz": 90.0}, "58.9 Hz at 640x480"),
+        ({"frame_rate_hz": 90.0}, "Nearest: 640x480 10 bit, up to 58.9 Hz"),
         ({"width_px": 1920, "height_px": 1080}, "no mode of the camera delivers 1920x1080 at 50 Hz"),
     ],
 )
@@ -298,7 +291,7 @@ def test_without_a_sensor_time_the_wall_clock_is_taken(monkeypatch: pytest.Monke
         camera = opened(monkeypatch, sensor)
         frame = camera.read()
         assert frame is not None
-        middle = sensor.start_ns + round(int(frame.image[0, 0, 2]) * 595 * 33.6e3) - 4972 * 500
+        middle = sensor.start_ns + round(int(frame.image[0, 0, 2]) * 594 * 33.67e3) - 4972 * 500
         assert abs(frame.t_ns - middle) < 1_000_000
 
 
