@@ -124,6 +124,7 @@ def targets_of(hosts: Sequence[str], rig: RigFile) -> list[Target]:
 
 ROOT = Path(__file__).resolve().parents[1]
 KEYS, CALIBRATION = "payload/keys/", "payload/calib_json/"
+SENSOR_FILES = "*-*x*.json"  # cameras of any rig: the doctor there names those that fit
 _OWN = ("pem", "key", "secret")
 # Runs on the other machine: the zip is a file in memory, from which Python imports.
 _BOOT = (
@@ -155,7 +156,8 @@ def bundle(
         own = ["rig.key", "ca.pem", *(f"devices/{name}.{kind}" for name in names for kind in _OWN)]
         files |= {KEYS + name: keys / name for name in own}
     if calibration is not None and rig is not None:
-        files |= {CALIBRATION + name: calibration / name for name in rig.files}
+        sensors = [f"cameras/{path.name}" for path in (calibration / "cameras").glob(SENSOR_FILES)]
+        files |= {CALIBRATION + name: calibration / name for name in (*rig.files, *sensors)}
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, path in files.items():

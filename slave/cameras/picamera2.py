@@ -30,6 +30,7 @@ from slave.cameras.picamera2_settings import (
     wanted_settings,
 )
 from slave.cameras.picamera2_streams import (
+    SensorMode,
     Streams,
     check_model,
     choose_mode,
@@ -45,6 +46,15 @@ TIMEOUT_S = 2.0  # libcamera itself gives a silent sensor up after 1 s
 SETTLE_FRAMES = 60  # sensors apply exposure and gain 2-3 frames late, the pipeline adds its own depth: ample
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
+
+
+def offered(index: int) -> tuple[str, tuple[SensorMode, ...]]:
+    """Model and modes of a camera that nobody has open."""
+    library, _ = open_library(index)
+    try:
+        return str(library.camera_properties.get("Model", "unknown model")), read_modes(library.sensor_modes)
+    finally:
+        library.close()
 
 
 class Picamera2Camera(Tunable):

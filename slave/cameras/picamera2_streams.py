@@ -86,8 +86,8 @@ def choose_mode(
 ) -> SensorMode:
     """Mode of `sensor`; of an unknown one that with the widest view.
 
-    It is fast enough and not smaller than `size`. Of modes with the same view the one with the fewest pixels is taken (binned: less noise, less to read out), then
-    the one with the most bits.
+    It is fast enough and not smaller than `size`. Of modes with the same view the one with the fewest pixels is taken
+    (binned: less noise, less to read out), then the one with the most bits.
     """
     if not modes:
         raise CameraError(

@@ -6,20 +6,25 @@ service has cannot be opened a second time: its frames are asked for, and of a V
 
 import argparse
 import contextlib
+import math
 import stat
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from common.calibration import CameraCalibration, RigCalibration, load
+from common.calibration.camera import Sensor, sensor_files
 from common.clock import SystemClock
-from common.errors import PhalanxError
+from common.errors import CameraError, PhalanxError
+from slave.cameras.picamera2 import offered
+from slave.cameras.picamera2_streams import SensorMode, choose_mode, choose_raw_mode
 from slave.cameras.settings import Setting, differences
 from slave.cameras.v4l2 import device_path
 from slave.cameras.v4l2_abi import KernelDevice
 from slave.cameras.v4l2_controls import AUTOMATICS, read_back, read_controls
+from slave.cameras.v4l2_formats import Offer, choose_offer, read_offers
 from slave.commands import devices
-from slave.doctor.host import Finding, System, fail, ok, unseen
+from slave.doctor.host import Finding, System, fail, ok, unseen, warn
 from slave.shared import shared_camera
 
 GROUPS = ("video", "dialout", "i2c", "gpio")  # SupplementaryGroups of the unit; a test compares them
@@ -144,16 +149,72 @@ def check_camera(slave: argparse.Namespace, taken: bool) -> Iterator[Finding]:
         yield unseen("camera", f"{slave.camera}: no device")
         return
     if taken and kind == "v4l2":
+        with contextlib.suppress(OSError, CameraError):  # `_automatics` says what is wrong
+            yield from _offers(slave)
         yield _automatics(device_path(place))
-    yield _opened(slave, file, taken, wrist=rig.kind == "wrist")
+    yield from _opened(slave, file, taken, wrist=rig.kind == "wrist")
 
 
-def _opened(slave: argparse.Namespace, file: CameraCalibration, taken: bool, *, wrist: bool) -> Finding:
+def _offers(slave: argparse.Namespace) -> Iterator[Finding]:
+    """What the camera can do, and which shipped files fit it."""
+    kind, _, place = str(slave.camera).partition(":")
+    files = {n: (one, one.sensor) for n, one in sensor_files(slave.calibration).items() if one.sensor}
+    if kind == "picamera2":
+        model, modes = offered(int(place) if place.isdecimal() else 0)
+        own = {name: one for name, one in files.items() if one[1].fits(model)}
+        text = "; ".join(mode.text(modes) + _angle(mode, own.values()) for mode in modes)
+        offers = ()
+    else:
+        device = KernelDevice(device_path(place))
+        try:
+            offers = read_offers(device, (0, 0))
+        finally:
+            device.close()
+        model, modes, text = "by its driver", (), "; ".join(offer.text() for offer in offers)
+        own = {name: one for name, one in files.items() if one[1].driver == kind}
+    yield ok("camera modes", f"{model}: {text}")
+    fit = [name for name, one in own.items() if _fits(*one, modes, offers)]
+    if fit:
+        yield ok("camera files", f"shipped ones that fit: {', '.join(fit)}")
+    else:
+        fix = "write one of a mode above, as docs/cameras.md has it"
+        yield warn("camera files", f"none of {slave.calibration}/cameras fits this camera", fix)
+
+
+def _fits(
+    file: CameraCalibration, sensor: Sensor, modes: Sequence[SensorMode], offers: Sequence[Offer]
+) -> bool:
+    """Whether the drivers would open the camera with this file."""
+    size, rate_hz = (file.width_px, file.height_px), file.frame_rate_hz
+    try:
+        if sensor.driver == "v4l2":
+            choose_offer(offers, size, rate_hz)
+        elif sensor.colours:
+            choose_mode(modes, rate_hz, size, sensor)
+        else:
+            choose_raw_mode(modes, rate_hz, size)
+    except CameraError:
+        return False
+    return True
+
+
+def _angle(mode: SensorMode, own: Iterable[tuple[CameraCalibration, Sensor]]) -> str:
+    """What a mode sees through the lens of the shipped files, where there are any."""
+    for file, sensor in own:
+        focal_px = sensor.nominal.fx_px * sensor.crop_px[2] / file.width_px
+        across, down = (2.0 * math.degrees(math.atan(0.5 * side / focal_px)) for side in mode.crop[2:])
+        return f", {across:.0f} x {down:.0f} deg"
+    return ""
+
+
+def _opened(slave: argparse.Namespace, file: CameraCalibration, taken: bool, *, wrist: bool) -> list[Finding]:
     """Open the camera as the slave does, or ask who has it, and read some frames."""
     found: list[Finding] = []
 
     def look() -> None:
         text = "the running service has it, and gave {} frames of it"
+        with contextlib.suppress(OSError, CameraError):  # opening it says what is wrong
+            found.extend(() if taken else _offers(slave))
         try:
             camera = shared_camera(slave, None, None)
             if camera is None and taken:
@@ -175,10 +236,10 @@ def _opened(slave: argparse.Namespace, file: CameraCalibration, taken: bool, *, 
     thread.start()
     given_up_s = 30.0
     thread.join(given_up_s)
-    if not found:
+    if thread.is_alive():
         fix = "check the cable with the power off; restart the Pi"
-        return fail("camera", f"no answer of its driver in {given_up_s:.0f} s", fix)
-    return found[0]
+        return [*found, fail("camera", f"no answer of its driver in {given_up_s:.0f} s", fix)]
+    return found
 
 
 def _automatics(path: Path) -> Finding:

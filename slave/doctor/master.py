@@ -45,7 +45,11 @@ def check_master(
         file = keys / RIG_KEY
         key = rig_key(system.environment, file if file.exists() else None)
     except (PhalanxError, OSError) as error:
-        why = "only root may read it: sudo phalanx-slave doctor" if isinstance(error, PermissionError) else error
+        why = (
+            "only root may read it: sudo phalanx-slave doctor"
+            if isinstance(error, PermissionError)
+            else error
+        )
         yield unseen("beacon", f"without a rig key no beacon can be distinguished from a foreign one: {why}")
         return
     yield _listen(SlaveLink("doctor", key, SystemClock(), os.urandom), port, bind, addresses)

@@ -12,6 +12,7 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, cast
 
@@ -198,10 +199,11 @@ def _only(rig: dict[str, Any], name: str) -> tuple[str, ...]:
 
 
 def _needed(calibration: Mapping[str, bytes], name: str, rig: dict[str, Any]) -> dict[str, bytes]:
-    """The files of this rig, and nobody else's hand."""
+    """The files of this rig and of sensors, and nobody else's hand."""
     files = [f"rigs/{name}.json", *(f"cameras/{camera}.json" for camera in rig["cameras"])]
     files += [f"hands/{rig['hand']}.json"] if rig.get("hand") else []
     files += [f"objects/{one}.json" for one in cast("list[str]", rig.get("objects") or [])]
+    files += [name for name in calibration if fnmatch(name, "cameras/*-*x*.json")]
     if missing := [file for file in files if file not in calibration]:
         raise InstallError(f"calib_json/{missing[0]}: missing; rig {name!r} needs it")
     return {file: calibration[file] for file in files}

@@ -280,19 +280,3 @@ def epoch_of(view: str) -> int:
     soon_s = 3.0  # until slaves have joined
     later_s = never_s if view == "still" else soon_s
     return time.monotonic_ns() + round(1e9 * later_s)
-
-
-def world_of_project() -> Path:
-    """Return the calib_json tree of the simulated world, of the source or the cwd.
-
-    Raises:
-        CalibrationError: Neither is there.
-    """
-    here = Path.cwd()
-    for tree in (Path(__file__).resolve().parents[3] / "calib_json", Path("calib_json")):
-        if (tree / "rigs" / "desk.json").exists():
-            return tree.relative_to(here) if tree.is_relative_to(here) else tree
-    raise CalibrationError(
-        "no simulated world: the project's own calib_json is neither beside the source nor in the working folder;"
-        " give the folder of a complete calib_json tree"
-    )

@@ -1,14 +1,12 @@
 """Set-up page writes its files, for the camera modes that were chosen.
 
-docs/cameras.md gives the reasons of the modes. Row times are those of the sensors' Linux drivers, line length
-over pixel rate, times the rows that are added up to one of the picture. Exposure and gains are where to start
-from: a bright room, markers well exposed and little smeared. A file that is replaced is kept under old/ of
+The modes are the project's own files of sensors, whose exposure and gains are where to start from: a bright
+room, markers well exposed and little smeared. A file that is replaced is kept under old/ of
 the tree. What no calibration file has a place for (which camera is simulated, which is a USB one) stands in
 console/setup.json of the same tree.
 """
 
 import os
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Literal
@@ -18,6 +16,7 @@ from msgspec.structs import replace
 
 from common.bus.keys import new_key, rig_key
 from common.calibration import CameraCalibration, RigCalibration, load, save
+from common.calibration.camera import sensor_files
 from common.calibration.files import Part, replacing
 from common.errors import CalibrationError
 from common.hand.fitting import with_three_back_markers
@@ -33,80 +32,40 @@ KINDS: dict[Kind, str] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Mode:
-    """One mode of one sensor.
-
-    Attributes:
-        row_time_us: From one row to the next; 0: all at once, or not known.
-        view: How much of the lens's full view is in the picture.
-        exposure_us, gain, colour_gains: Where to start from.
-        focus_m: Of a lens with a motor.
-    """
-
-    title: str
-    size_px: tuple[int, int]
-    rate_hz: float
-    row_time_us: float
-    view: str
-    exposure_us: float = 5000.0
-    gain: float = 2.0
-    colour_gains: tuple[float, float] = (1.5, 1.5)
-    focus_m: float | None = None
-
-    def file(self, name: str) -> CameraCalibration:
-        """A camera file of this mode, without lens and colours."""
-        return CameraCalibration(
-            version=1,
-            name=name,
-            width_px=self.size_px[0],
-            height_px=self.size_px[1],
-            frame_rate_hz=self.rate_hz,
-            exposure_us=self.exposure_us,
-            analogue_gain=self.gain,
-            colour_gains=self.colour_gains,
-            row_time_us=self.row_time_us,
-            focus_m=self.focus_m,
-        )
-
-
-def _usb_mode(width: int, height: int, rate_hz: float) -> Mode:
-    title = f"{width} x {height} at {rate_hz:g} Hz"
-    return Mode(title, (width, height), rate_hz, 0.0, "row time not known", colour_gains=(1.0, 1.0))
-
-
-# fmt: off
-MODES: dict[Kind, dict[str, Mode]] = {
-    "simulated": {},
-    "pi": {
-        "ov5647": Mode("Camera Module 1 (OV5647)", (640, 480), 58.0, 33.7, "full view"),
-        "imx219": Mode("Camera Module 2 (IMX219)", (820, 616), 40.0, 37.8, "full view"),
-        "imx219-fast": Mode("Camera Module 2 (IMX219), fast", (640, 480), 90.0, 18.9, "26° of the centre"),
-        "imx708": Mode("Camera Module 3 (IMX708)", (1152, 648), 55.0, 26.7, "full view", focus_m=0.6),
-        "imx708-fast": Mode("Camera Module 3 (IMX708), fast", (768, 432), 115.0, 18.4, "two thirds of the width",
-                            focus_m=0.6),
-        "imx296": Mode("Global Shutter Camera (IMX296)", (728, 544), 60.0, 0.0, "full view, all rows at once"),
-    },
-    "usb": {
-        "vga60": _usb_mode(640, 480, 60.0),
-        "vga30": _usb_mode(640, 480, 30.0),
-        "hd30": _usb_mode(1280, 720, 30.0),
-        "hd60": _usb_mode(1280, 720, 60.0),
-    },
-}
-# fmt: on
+DRIVERS: dict[Kind, str] = {"usb": "v4l2", "pi": "picamera2"}
 SIMULATED = "as-simulated"
 
 
+def project_tree() -> Path:
+    """Return the project's own calib_json: sensor files and a simulated world.
+
+    Raises:
+        CalibrationError: It is neither beside the source nor in the working folder.
+    """
+    here = Path.cwd()
+    for tree in (Path(__file__).resolve().parents[3] / "calib_json", Path("calib_json")):
+        if (tree / "rigs" / "desk.json").exists():
+            return tree.relative_to(here) if tree.is_relative_to(here) else tree
+    raise CalibrationError(
+        "no simulated world and no files of sensors: the project's own calib_json is neither beside the source nor in"
+        " the working folder; start the console in the project's folder"
+    )
+
+
 def modes_of(kind: Kind) -> dict[str, str]:
-    """What can be chosen for a camera of this kind: key -> text."""
+    """What can be chosen for a camera of this kind: key -> text.
+
+    Raises:
+        CalibrationError: The files of sensors are not there, or one is broken.
+    """
     if kind == "simulated":
         return {SIMULATED: "Simulated sensor, as its world has it"}
+    files = [(file.sensor, name, file) for name, file in sensor_files(project_tree()).items() if file.sensor]
+    seen = [one for one in files if one[0].driver == DRIVERS[kind] and one[0].colours]
     return {
-        key: f"{mode.title}: {mode.size_px[0]} x {mode.size_px[1]} at {mode.rate_hz:g} Hz, {mode.view}"
-        if kind == "pi"
-        else f"{mode.title} ({mode.view})"
-        for key, mode in MODES[kind].items()
+        name: f"{sensor.title} ({sensor.model}): {file.width_px} x {file.height_px} at {file.frame_rate_hz:g} Hz,"
+        f" sees {sensor.view_deg[0]:.0f}° x {sensor.view_deg[1]:.0f}°"
+        for sensor, name, file in sorted(seen, key=lambda one: one[0].title)
     }
 
 
@@ -117,12 +76,12 @@ def new_file(kind: Kind, mode: str, name: str, truth: Path) -> CameraCalibration
     `truth`.
 
     Raises:
-        CalibrationError: The simulated world has no such camera.
+        CalibrationError: The simulated world has no such camera, or the sensor has no file.
     """
     if kind == "simulated":
         true = load(truth / "cameras" / f"{name}.json", CameraCalibration)
         return replace(true, intrinsics=None, markers=None, provenance={})
-    return MODES[kind][mode].file(name)
+    return replace(load(project_tree() / "cameras" / f"{mode}.json", CameraCalibration), name=name)
 
 
 KEY_FILE = "rig.key"
@@ -230,9 +189,10 @@ def write_cameras(tree: Path, plan: Plan) -> list[Path]:
 
 
 def same_mode(one: CameraCalibration, other: CameraCalibration) -> bool:
-    """Return whether lens and colours hold for both: same size and read-out."""
+    """Return whether lens and colours hold for both: same size, read-out and view."""
     keys = ("width_px", "height_px", "row_time_us", "focus_m")
-    return all(getattr(one, key) == getattr(other, key) for key in keys)
+    views = [file.sensor and (file.sensor.model, file.sensor.crop_px) for file in (one, other)]
+    return views[0] == views[1] and all(getattr(one, key) == getattr(other, key) for key in keys)
 
 
 def write_rig(tree: Path, plan: Plan) -> list[Path]:

@@ -10,7 +10,6 @@ from msgspec.structs import replace
 from nicegui import ui
 
 from common.errors import CalibrationError
-from master.console.setup.commands import world_of_project
 from master.console.setup.files import (
     KEY_FILE,
     KINDS,
@@ -20,6 +19,7 @@ from master.console.setup.files import (
     Kind,
     Plan,
     modes_of,
+    project_tree,
 )
 from master.console.setup.parts import Desk, heading
 
@@ -42,7 +42,11 @@ def panel_cameras(desk: Desk) -> None:
             rows.show()
 
     def change() -> None:
-        rows.choose(kind.value or "simulated", int(count.value or 2))
+        try:
+            rows.choose(kind.value or "simulated", int(count.value or 2))
+        except CalibrationError as error:
+            desk.problem.show(str(error))
+            return
         count.set_options(rows.counts(), value=rows.count)
         show()
 
@@ -94,7 +98,7 @@ class _Rows:
             return
         if not self._truth:
             try:
-                self._truth = str(world_of_project())
+                self._truth = str(project_tree())
             except CalibrationError as error:
                 ui.label(str(error)).classes("setup-error")
         truth = ui.input("Folder of the simulated world", value=self._truth).classes("w-full max-w-xl")

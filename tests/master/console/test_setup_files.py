@@ -22,7 +22,6 @@ from master.calibrate.tree_files import provenance
 from master.console.setup.files import (
     KEY_FILE,
     KINDS,
-    MODES,
     PLAN,
     CameraPlan,
     Plan,
@@ -41,7 +40,7 @@ RANGE = HsvRange(hsv_low=(10, 60, 60), hsv_high=(20, 255, 255))
 
 
 def plan(**more: object) -> Plan:
-    cameras = tuple(CameraPlan(name=name, kind="usb", mode="vga60") for name in ("left", "right"))
+    cameras = tuple(CameraPlan(name=name, kind="usb", mode="usb-640x480") for name in ("left", "right"))
     return replace(Plan(cameras=cameras), **more)
 
 
@@ -74,7 +73,10 @@ def test_every_mode_makes_a_file_that_validates(tmp_path: Path, root: Path) -> N
             assert back.exposure_us < 1e6 / back.frame_rate_hz
             # All rows are read out before the next frame begins.
             assert back.height_px * back.row_time_us < 1e6 / back.frame_rate_hz
-    assert set(MODES) == set(KINDS)
+            assert file.sensor is None or back.name == "left"
+    assert {kind: len(modes_of(kind)) for kind in KINDS} == {"simulated": 1, "usb": 3, "pi": 11}
+    assert not any("OV9281 board" in text for text in modes_of("pi").values()), "it sees no colours"
+    assert next(iter(modes_of("pi"))) == "ov5647-1296x972"
 
 
 def test_from_an_empty_folder_each_step_is_done_by_its_files_alone(tmp_path: Path) -> None:
@@ -114,7 +116,9 @@ def test_what_contradicts_is_stale_and_says_what_to_do(tmp_path: Path) -> None:
         Done.STALE,
         "the lens of left is newer than the places: measure them again",
     )
-    other = replace(settings, cameras=(*settings.cameras, CameraPlan(name="left2", kind="usb", mode="hd30")))
+    other = replace(
+        settings, cameras=(*settings.cameras, CameraPlan(name="left2", kind="usb", mode="usb-1280x720"))
+    )
     write_cameras(tmp_path, other)
     assert states(tmp_path, other)["rig"] is Done.STALE
     path.write_text("{")
@@ -129,7 +133,7 @@ def test_the_same_mode_keeps_a_lens_and_another_keeps_the_old_file_aside(tmp_pat
     measured(tmp_path)
     assert write_cameras(tmp_path, settings) == []
     assert load(tmp_path / "cameras/left.json", CameraCalibration).intrinsics == LENS
-    hd = replace(settings, cameras=tuple(replace(camera, mode="hd30") for camera in settings.cameras))
+    hd = replace(settings, cameras=tuple(replace(camera, mode="usb-1280x720") for camera in settings.cameras))
     assert len(write_cameras(tmp_path, hd)) == 2
     assert load(tmp_path / "cameras/left.json", CameraCalibration).intrinsics is None
     (kept,) = tmp_path.glob("old/*/cameras/left.json")
@@ -143,7 +147,7 @@ def test_the_same_mode_keeps_a_lens_and_another_keeps_the_old_file_aside(tmp_pat
 def test_cameras_that_cannot_be_a_rig_are_refused(
     tmp_path: Path, names: tuple[str, ...], settings: str
 ) -> None:
-    cameras = tuple(CameraPlan(name=name, kind="usb", mode="vga60") for name in names)
+    cameras = tuple(CameraPlan(name=name, kind="usb", mode="usb-640x480") for name in names)
     with pytest.raises(CalibrationError, match=settings):
         write_cameras(tmp_path, Plan(cameras=cameras))
     assert not (tmp_path / PLAN).exists()

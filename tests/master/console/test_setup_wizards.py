@@ -198,7 +198,7 @@ def test_command_lines_are_ones_that_the_programs_take(tree: Path) -> None:
 def _cameras(kind: str, device: str = "", options: str = "") -> tuple[CameraPlan, ...]:
     real = "usb" if kind == "usb" else "pi" if kind == "pi" else "simulated"
     return tuple(
-        CameraPlan(name=name, kind=real, mode="vga60", device=device, options=options)
+        CameraPlan(name=name, kind=real, mode="usb-640x480", device=device, options=options)
         for name in ("left", "right")
     )
 

@@ -8,17 +8,21 @@ import threading
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from shutil import copytree
 
 import pytest
+from msgspec.structs import replace
 
 from common.bus.keys import issue, new_authority, new_key
+from common.calibration import CameraCalibration, load, save
+from common.calibration.camera import sensor_files
 from common.clock import SystemClock
 from common.machine import ROOT, Program
 from master.run.link import MasterLink
 from slave.__main__ import main
 from slave.cli.table import PROGRAM
 from slave.doctor.command import examine
-from slave.doctor.devices import check_devices, check_groups
+from slave.doctor.devices import check_camera, check_devices, check_groups
 from slave.doctor.host import (
     Finding,
     Ran,
@@ -39,6 +43,9 @@ from slave.doctor.host import (
     warn,
 )
 from slave.doctor.master import check_keys, check_master
+from tests.slave.fake_picamera2 import Sensor, install
+from tests.slave.fake_v4l2 import Camera, FakeDevice
+from tests.slave.recorded_lists import PI_CAMERAS, USB_CAMERAS
 
 CALIBRATION = Path(__file__).resolve().parents[3] / "calib_json"
 NOW = datetime(2026, 11, 22, tzinfo=UTC)
@@ -409,3 +416,74 @@ def test_it_runs_without_any_hardware(capsys: pytest.CaptureFixture[str]) -> Non
     assert code == 1  # there is no such camera
     assert "/dev/none" in output
     assert "not looked at:" in output
+
+
+def camera_findings(
+    monkeypatch: pytest.MonkeyPatch, tree: Path, driver: str, file: CameraCalibration
+) -> dict[str, Finding]:
+    """What the doctor says of a camera, where the camera file of `left` is this one."""
+    save(tree / "cameras/left.json", replace(file, name="left"))
+    words = ["run", "--name", "left", "--rig", "desk", "--camera", driver, "--calibration", str(tree)]
+    codes = ["--control", "gain=32", "--control", "white_balance_temperature=4600"]
+    slave = PROGRAM.parse([*words, *(codes if driver == "v4l2" else [])])[1]
+    return by_check(list(check_camera(slave, taken=False)))
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Path:
+    return Path(copytree(CALIBRATION, tmp_path / "calib"))
+
+
+@pytest.mark.parametrize(
+    ("camera", "shown", "fitting"),
+    [
+        ("ov5647", "640x480 10 bit, up to 58.9 Hz, 98 % of the full view, 53 x 41 deg",
+         "ov5647-1296x972, ov5647-640x480"),
+        ("imx219", "640x480 10 bit, up to 206.7 Hz, 15 % of the full view, 27 x 20 deg",
+         "imx219-640x480, imx219-820x616"),
+        ("imx219 since 6.6", "1640x1232 8 bit, up to 83.7 Hz", "imx219-640x480, imx219-820x616-8bit, imx219-820x616"),
+        ("imx708", "1536x864 10 bit, up to 120.1 Hz, 44 % of the full view, 47 x 27 deg",
+         "imx708-1152x648, imx708-768x432, imx708-864x648"),
+        ("imx708_wide", "2304x1296 10 bit, up to 56.0 Hz, 100 % of the full view, 99 x 67 deg",
+         "imx708_wide-1152x648, imx708_wide-864x648"),
+        ("imx296", "1456x1088 10 bit, up to 60.4 Hz, 100 % of the full view, 45 x 35 deg", "imx296-728x544"),
+        ("ov9281", "640x400 8 bit, up to 309.8 Hz", "ov9281-1280x720, ov9281-1280x800, ov9281-640x400"),
+    ],
+)  # fmt: skip
+def test_what_a_pi_camera_can_do_and_the_shipped_files_that_fit(
+    monkeypatch: pytest.MonkeyPatch, tree: Path, camera: str, shown: str, fitting: str
+) -> None:
+    install(monkeypatch, Sensor.of(PI_CAMERAS[camera]))
+    found = camera_findings(
+        monkeypatch, tree, "picamera2", load(tree / "cameras/right.json", CameraCalibration)
+    )
+    assert shown in found["camera modes"].text
+    assert found["camera files"].text == f"shipped ones that fit: {fitting}"
+
+
+def test_a_rigs_file_of_a_mode_that_the_sensor_lacks_is_wrong_with_the_nearest_and_a_fitting_one_is_well(
+    monkeypatch: pytest.MonkeyPatch, tree: Path
+) -> None:
+    install(monkeypatch, Sensor.of(PI_CAMERAS["ov5647"]))
+    desk = replace(load(tree / "cameras/right.json", CameraCalibration), frame_rate_hz=60.0)
+    found = camera_findings(monkeypatch, tree, "picamera2", desk)
+    assert found["camera"].verdict is Verdict.FAIL
+    assert "640x480 at 60 Hz. Nearest: 640x480 10 bit, up to 58.9 Hz" in found["camera"].text
+    fits = sensor_files(tree)["ov5647-640x480"]
+    assert camera_findings(monkeypatch, tree, "picamera2", fits)["camera"].verdict is Verdict.OK
+    for path in (tree / "cameras").glob("ov5647-*.json"):
+        path.unlink()
+    assert camera_findings(monkeypatch, tree, "picamera2", fits)["camera files"].verdict is Verdict.WARN
+
+
+def test_what_a_usb_camera_offers_is_listed_as_its_driver_has_it(
+    monkeypatch: pytest.MonkeyPatch, tree: Path
+) -> None:
+    def device(_path: Path) -> FakeDevice:
+        return FakeDevice(Camera(formats=USB_CAMERAS["USB Camera"]))
+
+    monkeypatch.setattr("slave.doctor.devices.KernelDevice", device)
+    desk = load(tree / "cameras/right.json", CameraCalibration)
+    found = camera_findings(monkeypatch, tree, "v4l2", desk)
+    assert "MJPG 1280x720 at 5, 10, 15, 20, 25, 30 Hz" in found["camera modes"].text
+    assert found["camera files"].text == "shipped ones that fit: usb-1280x720, usb-640x480"
