@@ -18,9 +18,8 @@ from common.calibration import HandProfile, Provenance, RestJoint
 from common.errors import FitError
 from common.hand.model import CHAINS, FINGERS, JOINTS, TIPS, WRIST, HandModel, couplings_of
 from common.hand.profiles import mirrored_profile, scaled_profile
-from master.calibrate.hand.curves import Knots
 from master.calibrate.hand.observed import GRID_S, Alignment, Observed, align, flat_scale, missing_steps
-from master.calibrate.hand.problem import HandRoutineProblem, ShapeFit, fit_shape
+from master.calibrate.hand.problem import HandRoutineProblem, Knots, ShapeFit, fit_shape
 from master.calibrate.hand.shape import PER_FINGER, Priors, RoutineTargets, Shape
 from master.calibrate.tree_files import provenance, vector_of
 

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.arrays import Float
+from common.arrays import Float, Int
 from common.errors import FitError
 from common.geometry.transforms import rotation_vector_to_matrix, skew, transform
 from common.hand.model import HandModel
 from master.calibrate.adjust import Normal, huber, minimise
-from master.calibrate.hand.curves import Knots
 from master.calibrate.hand.shape import (
     BIAS,
     LENGTH,
@@ -35,6 +34,40 @@ _PALM = 6
 _DIP = 3
 _LOSS = huber(3.0)
 _SLACK_RAD = float(np.radians(10.0))  # hands bend farther than the published limits
+
+
+_WIDTH = 4  # coefficients that one epoch depends on
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Knots:
+    """Angles and the palm's pose over T epochs, as uniform cubic B-splines.
+
+    So frames need no common rate and no averaging (trajectory estimation in continuous time: Furgale, Barfoot &
+    Sibley, ICRA 2012).
+    """
+
+    spacing_s: float  # between coefficients [s]
+    time_s: Float  # (K,) middle of each coefficient's bump [s]
+    first: Int  # (T,) first of the four coefficients of each epoch
+    weight: Float  # (T, 4) theirs; they add up to one
+
+    @classmethod
+    def over(cls, t_s: Float, spacing_s: float) -> "Knots":
+        """Knots that cover rising times (T,) [s]."""
+        x = (t_s - t_s[0]) / spacing_s
+        first = np.floor(x).astype(np.int64)
+        u = x - first
+        weight = np.stack(
+            [(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3], axis=1
+        )
+        count = int(first[-1]) + _WIDTH
+        return cls(spacing_s, t_s[0] + spacing_s * (np.arange(count) - 1.0), first, weight / 6.0)
+
+    def at(self, coefficients: Float) -> Float:
+        """Values (T, n) of curves with coefficients (K, n)."""
+        picked = coefficients[self.first[:, None] + np.arange(_WIDTH)]
+        return np.einsum("tw,twn->tn", self.weight, picked)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

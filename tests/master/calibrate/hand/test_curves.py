@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from master.calibrate.hand.curves import Knots
+from master.calibrate.hand.problem import Knots
 
 
 def test_curves_reproduce_a_straight_line() -> None:
