@@ -10,6 +10,7 @@ from typing import Annotated, Literal, get_args
 
 import numpy as np
 from msgspec import Meta
+from msgspec.structs import replace
 
 from common.arrays import Float
 from common.calibration.files import (
@@ -28,7 +29,7 @@ from common.calibration.files import (
     Vector3,
     check_quaternion,
 )
-from common.calibration.hand import Finger
+from common.calibration.hand import Finger, HandProfile
 from common.calibration.object_profile import check_pose
 from common.calibration.strobe import StrobeCalibration, check_strobe
 from common.errors import CalibrationError
@@ -204,7 +205,8 @@ class RigCalibration(Part, frozen=True):
     a system whose devices track themselves (Lighthouse) lies in the rig. `gestures`: file of what counts as a gesture;
     null: as calib_json/gestures/default.json has it.
     `solver`: whose hand is published: that of the card's line (fabrik), or that which the estimator makes from there.
-    `other_hands`: hands of its markers besides `hand`; each marker is that of the hand whose file mounts it.
+    `other_hands`: hands of its markers besides `hand`; each marker is that of the hand whose file mounts it, and
+    `left_thumb` the `thumb` of the left hand. Hands painted alike have the same colour ranges in the camera files.
     `T_world_rig`: where the rig lies in the frame that several rigs share; null: its frame is that one.
     `stamp_offset_us`: how much later the frames of a camera were taken than their stamps state.
     From `laser_plane` on, the keys of a wrist rig, in its camera's frame; `forward`: how the place of the laser on a
@@ -327,6 +329,49 @@ def _check_imu(imu: ImuCalibration, cameras: tuple[str, ...], where: str) -> Non
     for key, value in (("q_palm_imu", imu.q_palm_imu), ("q_rig_world", imu.q_rig_world)):
         if value is not None:
             check_quaternion(value, f"{where}: imu.{key}")
+
+
+def rigs_by_hand(
+    rig: RigCalibration, hands: Mapping[str, HandProfile]
+) -> list[tuple[str, RigCalibration, tuple[int, ...]]]:
+    """Split a rig into (hand, the rig for that hand alone, its rows of the markers).
+
+    A rig with `other_hands` watches several; each of its markers is that of the hand that mounts it. `left_thumb` is
+    the `thumb` of the left hand, and is called so in the rig for that hand; `right_thumb` likewise. Free markers and
+    objects stay with its first hand.
+
+    Raises:
+        CalibrationError: A marker is mounted by none of the hands or by two, or a hand mounts none.
+    """
+    if len(hands) == 1:
+        return [(rig.hand, rig, tuple(range(len(rig.markers))))]
+    owners: dict[str, dict[str, str]] = {marker: {} for marker in rig.markers}
+    for name, hand in hands.items():
+        for mounted in hand.markers:
+            sided = f"{hand.side}_{mounted}"
+            owners.get(sided if sided in owners else mounted, {})[name] = mounted
+    owners |= {marker: {rig.hand: marker} for marker in rig.free_markers}
+    for marker, named in owners.items():
+        if len(named) != 1:
+            who = " and ".join(named) or f"none of {', '.join(hands)}"
+            raise CalibrationError(
+                f"rig {rig.name!r}: other_hands: marker {marker!r} is mounted by {who}; each is of one hand"
+            )
+    parts: list[tuple[str, RigCalibration, tuple[int, ...]]] = []
+    for name in hands:
+        chosen = tuple(m for m, marker in enumerate(rig.markers) if name in owners[marker])
+        if not chosen:
+            raise CalibrationError(f"rig {rig.name!r}: other_hands: {name!r} mounts none of its markers")
+        own = replace(
+            rig,
+            hand=name,
+            other_hands=(),
+            markers=tuple(owners[rig.markers[m]][name] for m in chosen),
+            free_markers=rig.free_markers if name == rig.hand else (),
+            objects=rig.objects if name == rig.hand else (),
+        )
+        parts.append((name, own, chosen))
+    return parts
 
 
 def terms_of(xy: Float, degree: int) -> Float:

@@ -22,7 +22,6 @@ from common.calibration.object_profile import ObjectProfile
 from common.calibration.rig import check_places
 from common.errors import CalibrationError
 from common.geometry.transforms import matrix_to_quaternion, quaternion_to_matrix, transform
-from common.hand.model import HandModel
 
 _ALIKE = ("markers", "free_markers", "frame_sync", "filter", "solver")
 
@@ -107,47 +106,6 @@ def _refuse_shared(owners: str, owned: Iterable[tuple[str, str]], remedy: str = 
             text = f"{owners} {owner[what]!r} and {name!r} both have {what}"
             raise CalibrationError(f"{text}: {remedy}" if remedy else text)
         owner[what] = name
-
-
-def rigs_by_hand(
-    rig: RigCalibration, hands: Mapping[str, HandModel]
-) -> list[tuple[str, RigCalibration, tuple[int, ...]]]:
-    """Split a rig into (hand, the rig for that hand alone, its rows of the markers).
-
-    A rig with `other_hands` watches several; each of its markers is that of the hand that mounts it, and free
-    markers and objects stay with its first hand.
-
-    Raises:
-        CalibrationError: A marker is mounted by none of the hands or by two, or a hand mounts none.
-    """
-    if len(hands) == 1:
-        return [(rig.hand, rig, tuple(range(len(rig.markers))))]
-    owner: dict[str, str] = dict.fromkeys(rig.free_markers, rig.hand)
-    for marker in rig.markers:
-        if marker in rig.free_markers:
-            continue
-        owners = [name for name, hand in hands.items() if marker in hand.profile.markers]
-        if len(owners) != 1:
-            who = " and ".join(owners) or f"none of {', '.join(hands)}"
-            raise CalibrationError(
-                f"rig {rig.name!r}: other_hands: marker {marker!r} is mounted by {who}; each is of one hand"
-            )
-        owner[marker] = owners[0]
-    parts: list[tuple[str, RigCalibration, tuple[int, ...]]] = []
-    for name in hands:
-        chosen = tuple(m for m, marker in enumerate(rig.markers) if owner[marker] == name)
-        if not chosen:
-            raise CalibrationError(f"rig {rig.name!r}: other_hands: {name!r} mounts none of its markers")
-        own = replace(
-            rig,
-            hand=name,
-            other_hands=(),
-            markers=tuple(rig.markers[m] for m in chosen),
-            free_markers=rig.free_markers if name == rig.hand else (),
-            objects=rig.objects if name == rig.hand else (),
-        )
-        parts.append((name, own, chosen))
-    return parts
 
 
 def in_world(rig: RigCalibration) -> RigCalibration:

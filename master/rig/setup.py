@@ -22,9 +22,10 @@ from common.calibration import (
     Volume,
     load,
 )
+from common.calibration.camera import Hsv
 from common.calibration.gesture_settings import GestureSettings, default_gestures
 from common.calibration.object_profile import ObjectProfile
-from common.calibration.rig import FingerLine
+from common.calibration.rig import FingerLine, rigs_by_hand
 from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
 from common.hand.model import FINGERS, HandModel
@@ -40,8 +41,9 @@ from master.rig.merge import (
     objects_of,
     refuse_shared_objects,
     refuse_shared_senders,
-    rigs_by_hand,
 )
+
+Paints = tuple[tuple[Hsv, Hsv] | None, ...]  # lowest and highest colour of each marker
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,6 +123,7 @@ class RigSetup:
         wrist: Laser plane and palm of a wrist device; None: there is none.
         wrist_rig: The rig file of that device.
         rows: Camera -> which rows of its messages are `markers`, where it watches another hand as well.
+        paints: Camera -> the colour range of each of `markers`, likewise; None: it has none.
         objects: What else its marker cameras watch, in the order of the rig; of a rig of several hands with
             the first.
         gestures: What counts as a gesture of this hand.
@@ -134,6 +137,7 @@ class RigSetup:
     wrist: WristSetup | None = None
     wrist_rig: RigCalibration | None = None
     rows: dict[str, tuple[int, ...]] = field(default_factory=dict[str, tuple[int, ...]])
+    paints: dict[str, Paints] = field(default_factory=dict[str, Paints])
     objects: tuple[ObjectProfile, ...] = ()
     gestures: GestureSettings = field(default_factory=default_gestures)
     settings: Settings = DEFAULT
@@ -253,7 +257,8 @@ class RigSetup:
         out = cls.of(merged, cameras, setups[0].hand, objects or None)
         named = (setup.gestures for setup in setups if setup.rig.gestures is not None)
         rows = {name: which for setup in marked for name, which in setup.rows.items()}
-        out = with_fields(out, gestures=next(named, setups[0].gestures), rows=rows)
+        paints = {name: which for setup in marked for name, which in setup.paints.items()}
+        out = with_fields(out, gestures=next(named, setups[0].gestures), rows=rows, paints=paints)
         for device in wrist_setups:  # one, or none
             cameras |= device.cameras
             out = with_fields(out, cameras=cameras, wrist=device.wrist, wrist_rig=device.rig)
@@ -315,10 +320,13 @@ def setups_of(
     found: dict[str, list[RigSetup]] = {}
     for rig in rigs:
         hands = {name: hand_named(name) for name in (rig.hand, *rig.other_hands)}
-        for name, own, chosen in rigs_by_hand(rig, hands):
+        for name, own, chosen in rigs_by_hand(rig, {name: hand.profile for name, hand in hands.items()}):
             setup = RigSetup.of(own, cameras, hands[name], objects)
-            rows = dict.fromkeys(rig.cameras, chosen) if rig.other_hands else {}
-            setup = with_fields(setup, rows=rows, gestures=gestures_of(rig.gestures))
+            if rig.other_hands:
+                names = [rig.markers[m] for m in chosen]
+                paints = {camera: _paints_of(cameras[camera], names) for camera in rig.cameras}
+                setup = with_fields(setup, rows=dict.fromkeys(rig.cameras, chosen), paints=paints)
+            setup = with_fields(setup, gestures=gestures_of(rig.gestures))
             found.setdefault(name, []).append(setup)
     joined = tuple(RigSetup.joined(setups) for setups in found.values())
     refuse_shared_objects([(setup.rig.name, setup.objects) for setup in joined])
@@ -326,6 +334,11 @@ def setups_of(
     if twice := [name for name in names if names.count(name) > 1]:
         raise CalibrationError(f"hands {', '.join(found)}: two files call their hand {twice[0]!r}")
     return joined
+
+
+def _paints_of(camera: CameraCalibration, markers: Sequence[str]) -> Paints:
+    ranges = camera.markers or {}
+    return tuple((ranges[m].hsv_low, ranges[m].hsv_high) if m in ranges else None for m in markers)
 
 
 def load_setups(
