@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from common.arrays import Float, Image
+from common.arrays import Bool, Float, Image
 from common.geometry.transforms import cross
 from common.sim import light, raster
 from common.sim.light import LENS_SIGMA_PX, Float32
@@ -68,12 +68,15 @@ class Painted:
     Attributes:
         marker: Place in the rig; None of a tag.
         t_s: Scene time of its row [s].
+        by, snapshot: Who paints it, and of what.
         feature: Bead or tag of an object; None of a marker on the hand.
     """
 
     marker: int | None
     coverage: Coverage
     t_s: float
+    by: "Painter"
+    snapshot: Snapshot
     feature: SeenBead | SeenSheet | None = None
 
     @property
@@ -89,7 +92,7 @@ class Painter:
 
     def __init__(self, view: View) -> None:
         """Prepare colours; CalibrationError: a marker of hand or object has none."""
-        self._view = view
+        self.view = view
         self._size = (view.optics.width_px, view.optics.height_px)
         rig, beads = view.scene.rig, view.scene.tracked.beads
         self._colours = {
@@ -104,9 +107,14 @@ class Painter:
         self._caps = {cap.marker: c for c, cap in enumerate(view.surface.caps)}
         self._boxes = {box.marker: box.corners for box in view.surface.boxes}
 
-    def cover(self, snapshot: Snapshot, cards: tuple[Shape, ...]) -> list[Painted]:
-        """Every marker in order, then beads and tags, everything nearer cut out."""
-        view, speed = self._view, snapshot.speed_uv
+    def cover(
+        self, snapshot: Snapshot, cards: tuple[Shape, ...], hands: Sequence[Shape] = ()
+    ) -> list[Painted]:
+        """Every marker in order, then beads and tags, everything nearer cut out.
+
+        `hands`: outlines of the hands before this one.
+        """
+        view, speed = self.view, snapshot.speed_uv
         caps, boxes = view.surface.caps, view.surface.boxes
         box_uv = [snapshot.uv[box.corners] for box in boxes]
         corners_uv = (*snapshot.cap_uv, *box_uv)
@@ -125,10 +133,17 @@ class Painter:
         touching &= places.depth[:, None] > places.depth
         touching[:, len(caps) :] = touching[len(caps) :] = False
         things = things_before(snapshot, places, places.depth)
+        before = _over(hands, places)
         markers = [
             raster.Marker(
                 outlines[k],
-                (*surface, *(outlines[n] for n in np.flatnonzero(touching[k])), *things[k], *cards),
+                (
+                    *surface,
+                    *(outlines[n] for n in np.flatnonzero(touching[k])),
+                    *things[k],
+                    *(hands[n] for n in np.flatnonzero(before[k]).tolist()),
+                    *cards,
+                ),
                 view.own_finger(snapshot, k) if k < len(caps) else None,
             )
             for k, surface in enumerate(hand_before(snapshot, places))
@@ -136,7 +151,7 @@ class Painter:
         covers = raster.cover(markers, view.exposure_s, self._size)
         points = [*view.cap_centre.tolist(), *(box.corners.start for box in boxes)]
         painted = {
-            on.marker: Painted(on.marker, cover, float(snapshot.t_s[point]))
+            on.marker: Painted(on.marker, cover, float(snapshot.t_s[point]), self, snapshot)
             for on, cover, point in zip((*caps, *boxes), covers, points, strict=True)
         }
         features = self._cover_features(snapshot, cards, outlines, places.depth)
@@ -164,14 +179,10 @@ class Painter:
             [feature.uv for feature in features],
             at[:, 2],
             [shape.corners for shape in shapes],
-            self._view.behind_palm(snapshot, at),
+            self.view.behind_palm(snapshot, at),
             np.full(len(features), NO_PHALANX),
         )
-        low, high = (np.array([f(one.corners, axis=0) for one in hand]) for f in (np.min, np.max))
-        over = raster.overlaps(
-            low.reshape(-1, 2), high.reshape(-1, 2), places.low[:, None], places.high[:, None]
-        )
-        over &= hand_depth < places.depth[:, None]
+        over = _over(hand, places) & (hand_depth < places.depth[:, None])
         touching_m = 0.001  # a tag lies on what it is stuck on
         things = things_before(snapshot, places, places.depth - touching_m, on)
         markers = [
@@ -181,13 +192,20 @@ class Painter:
             )
             for k, surface in enumerate(hand_before(snapshot, places))
         ]
-        covers = raster.cover(markers, self._view.exposure_s, self._size)
+        covers = raster.cover(markers, self.view.exposure_s, self._size)
         return [
-            Painted(feature.marker if isinstance(feature, SeenBead) else None, cover, feature.t_s, feature)
+            Painted(
+                feature.marker if isinstance(feature, SeenBead) else None,
+                cover,
+                feature.t_s,
+                self,
+                snapshot,
+                feature,
+            )
             for feature, cover in zip(features, covers, strict=True)
         ]
 
-    def window(self, image: Image, group: list[Painted], snapshot: Snapshot) -> tuple[int, int, Image]:
+    def window(self, image: Image, group: list[Painted]) -> tuple[int, int, Image]:
         """Draw and blur the window of a group, in linear light; its x, y and pixels."""
         width, height = self._size
         every = np.array([item.box for item in group])
@@ -201,19 +219,19 @@ class Painter:
                 continue
             alpha = item.coverage.alpha[top - y : bottom - y, left - x : right - x, None]
             part = window[top - y0 : bottom - y0, left - x0 : right - x0]
-            part += (self._appearance(item, snapshot, box) - part) * alpha
+            part += (item.by._appearance(item, box) - part) * alpha
         window = cv2.GaussianBlur(window, (3, 3), LENS_SIGMA_PX)
         left, top = int(x0 > 0), int(y0 > 0)
         inner = window[top : -1 if y1 < height else None, left : -1 if x1 < width else None]
         return x0 + left, y0 + top, light.encode(np.asarray(inner, dtype=np.float32))
 
-    def _appearance(self, item: Painted, snapshot: Snapshot, box: Box) -> Float32:
+    def _appearance(self, item: Painted, box: Box) -> Float32:
         """Linear light (h, w, 3) as if the item's surface filled a box of pixels."""
         x0, y0, x1, y1 = box
         if isinstance(item.feature, SeenSheet):
             sheet = item.feature
-            return sheet_appearance(sheet, raster.moments(sheet.shape, self._view.exposure_s), box)
-        base, fills = self._fills(item, snapshot)
+            return sheet_appearance(sheet, raster.moments(sheet.shape, self.view.exposure_s), box)
+        base, fills = self._fills(item, item.snapshot)
         appearance = np.empty((y1 - y0, x1 - x0, 3), dtype=np.uint8)
         appearance[:] = base
         corner = raster.fixed(np.array([x0, y0]))
@@ -228,7 +246,7 @@ class Painter:
             side, colour = self._boxes[item.marker], self._colours[item.marker]
             top = snapshot.points[side][:4]
             normal = unit(cross(top[1] - top[0], top[3] - top[0]))
-            facing = float(normal @ self._view.to_light) * (-1.0 if float(normal @ top[0]) > 0.0 else 1.0)
+            facing = float(normal @ self.view.to_light) * (-1.0 if float(normal @ top[0]) > 0.0 else 1.0)
             above = raster.fixed(snapshot.uv[side][:4]), light.face_shade(colour, facing)
             return light.face_shade(colour, 0.25), [above]
         bead, (base, *colours) = item.feature, self._shades[item.marker]
@@ -255,7 +273,7 @@ class Painter:
 
     def truth(self, painted: Sequence[Painted], snapshot: Snapshot) -> MarkerView:
         """What is visible of all markers, in the order of the rig, and of the objects."""
-        view = self._view
+        view = self.view
         count = len(view.scene.rig.markers)
         uv, t_s = np.full((count, 2), np.nan), np.full(count, np.nan)
         visible, area = np.zeros(count), np.zeros(count)
@@ -276,6 +294,12 @@ class Painter:
                 np.array([feature.t_s for feature in (*beads, *sheets)]),
             )
         return MarkerView(uv, visible, area, t_s, objects)
+
+
+def _over(shapes: Sequence[Shape], places: Places) -> Bool:
+    """Which of S shapes (N, S) reach into the box of each of N markers."""
+    low, high = (np.array([f(one.corners, axis=0) for one in shapes]) for f in (np.min, np.max))
+    return raster.overlaps(low.reshape(-1, 2), high.reshape(-1, 2), places.low[:, None], places.high[:, None])
 
 
 def around(a: Box, b: Box) -> Box:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.arrays import Float, Image
+from common.calibration.rig import rigs_by_hand
 from common.errors import RecordingError
 from common.hand.model import CHAINS, FINGERS, WEBXR_JOINTS, HandModel
 from common.imu.csv_table import write_imu
@@ -48,11 +49,11 @@ class RenderedFrame(NamedTuple):
 
 
 class _Row(NamedTuple):
-    """Truth of one row: views and times of row 0 [s], scene at the reference time."""
+    """Truth of one row by hand: views and times of row 0 [s], scene at the reference."""
 
-    views: list[MarkerView]
+    views: list[tuple[MarkerView, ...]]
     t_row0: list[float]
-    reference: SceneTruth
+    reference: tuple[SceneTruth, ...]
 
 
 class SceneTake:
@@ -65,6 +66,7 @@ class SceneTake:
     def __init__(self, scene: Scene, seconds: float, start_s: float = 0.0) -> None:
         """Prepare `seconds` [s] from `start_s` [s]; ValueError: frame rates differ."""
         self._scene, self._start_s = scene, start_s
+        self._hands = scene, *scene.others
         names = scene.rig.cameras
         rates = {scene.cameras[name].frame_rate_hz for name in names}
         if len(rates) != 1:
@@ -84,20 +86,22 @@ class SceneTake:
 
     def manifest(self, continuous: bool = True) -> Manifest:
         """Return the manifest; its clicks are exact centroids in the first frames."""
-        scene = self._scene
+        scene, rig = self._scene, self._scene.watched or self._scene.rig
+        parts = rigs_by_hand(rig, {one.rig.hand: one.model.profile for one in self._hands})
         clicks: dict[str, dict[str, tuple[float, float]]] = {}
         for name, renderer, offset in zip(scene.rig.cameras, self._renderers, self._offsets, strict=True):
-            uv = renderer.markers(self._start_s + offset).uv.tolist()
+            _, views = renderer.observe_all(self._start_s + offset)
             clicks[name] = {
-                marker: (u, v)
-                for marker, (u, v) in zip(scene.rig.markers, uv, strict=True)
+                rig.markers[m]: (u, v)
+                for (_, _, rows), view in zip(parts, views, strict=True)
+                for m, (u, v) in zip(rows, view.uv.tolist(), strict=True)
                 if np.isfinite([u, v]).all()
             }
         return Manifest(
             version=1,
             kind="markers",
             cameras={name: scene.cameras[name] for name in scene.rig.cameras},
-            rig=scene.rig,
+            rig=rig,
             clicks=clicks,
             continuous=continuous,
             note=f"rendered scene, seed {scene.seed}",
@@ -109,38 +113,44 @@ class SceneTake:
         scene = self._scene
         for k in range(self.count):
             times = [self._start_s + k * self._period_s + offset for offset in self._offsets]
-            views: list[MarkerView] = []
+            views: list[tuple[MarkerView, ...]] = []
             for name, renderer, t in zip(scene.rig.cameras, self._renderers, times, strict=True):
-                image, view = renderer.observe(t)
+                image, view = renderer.observe_all(t)
                 views.append(view)
                 yield RenderedFrame(name, k, FIRST_NS + round(t * 1e9), Illumination.NONE, image)
-            self._rows.append(_Row(views, times, scene.truth(times[0] + self._centre_s)))
+            at_s = times[0] + self._centre_s
+            self._rows.append(_Row(views, times, tuple(one.truth(at_s) for one in self._hands)))
 
     def truth(self) -> Arrays:
-        """One row per frame of each camera."""
-        rows, truths = self._rows, [row.reference for row in self._rows]
+        """One row per frame of each camera; of other hands than the first KEY_HAND."""
+        arrays = self._truth(0) | self._truth_of_objects()
+        for number, other in enumerate(self._hands[1:], 1):
+            arrays |= {f"{key}_{other.rig.hand}": values for key, values in self._truth(number).items()}
+        return arrays
+
+    def _truth(self, hand: int) -> Arrays:
+        rows, truths = self._rows, [row.reference[hand] for row in self._rows]
         seen = {"uv": "uv", "frac": "visible", "px": "area", "t_cap": "t_s"}
         return {
             **{
-                key: np.array([[getattr(view, of) for view in row.views] for row in rows])
+                key: np.array([[getattr(view[hand], of) for view in row.views] for row in rows])
                 for key, of in seen.items()
             },
             "t_row0": np.array([row.t_row0 for row in rows]),
             "t_ref": np.array([truth.t_s for truth in truths]),
             "paint_centroid": np.array([truth.markers_m for truth in truths]),
             "joints": np.array([truth.joints.position_m[1:] for truth in truths]),
-            "angles": np.array([named_angles(self._scene.model, truth.angles_rad) for truth in truths]),
+            "angles": np.array([named_angles(self._hands[hand].model, truth.angles_rad) for truth in truths]),
             "T_palm": np.array([truth.T_rig_palm for truth in truths]),
             "flexion": np.array([truth.wrist_angles_rad for truth in truths]),
-            **self._truth_of_objects(),
         }
 
     def _truth_of_objects(self) -> Arrays:
         """Poses of each tracked object, what cameras saw of it, its tags' corners."""
         arrays: Arrays = {}
         for name in self._scene.rig.objects:
-            seen = [[view.objects[name] for view in row.views] for row in self._rows]
-            arrays[f"object_{name}"] = np.array([row.reference.objects[name] for row in self._rows])
+            seen = [[view[0].objects[name] for view in row.views] for row in self._rows]
+            arrays[f"object_{name}"] = np.array([row.reference[0].objects[name] for row in self._rows])
             arrays[f"object_{name}_visible"] = np.array([[one.visible for one in row] for row in seen])
             arrays[f"object_{name}_corners"] = np.array([[one.corners_uv for one in row] for row in seen])
         return arrays

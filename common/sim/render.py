@@ -1,8 +1,8 @@
 """Renderer from scene to camera image, with the truth of what each marker shows.
 
-Order of drawing: desk; finger parts, palm and things from far to near, each as nested outlines that make it look
-round; sleeve (first where the camera looks into it); motion blur; card; markers (see `painter`); lens blur; the
-light, where it is not the calibrated one; noise.
+Order of drawing: desk; of each hand, the nearer wholly before the farther, finger parts, palm and things from far to
+near, each as nested outlines that make it look round; sleeve (first where the camera looks into it); motion blur; card;
+markers (see `painter`); lens blur; the light, where it is not the calibrated one; noise.
 
 Another light multiplies the finished picture, channel by channel, in linear light. A highlight that is already white
 there stays as bright as a white marker in the new light, also where a real one would outshine it. Another exposure or
@@ -11,6 +11,7 @@ gain of the camera does the same (`Renderer.exposed`), and a longer exposure sme
 
 from collections.abc import Iterable
 from copy import copy
+from functools import reduce
 
 import cv2
 import numpy as np
@@ -24,10 +25,11 @@ from common.sim.painter import Box, MarkerView, Painted, Painter, around
 from common.sim.raster import Shape
 from common.sim.scene import DESK_DEPTH_M, Scene
 from common.sim.surface import CAPSULES, PALM_HULL
-from common.sim.view import LAYERS, Snapshot, View
+from common.sim.view import LAYERS, Snapshot, View, outlines_of
 
 _PALM = list(PALM_HULL)
 ROOTS = (0, 3, 6, 9, 12)  # capsules that begin at the palm
+_Shown = tuple[Snapshot, list[Painted]]  # what is seen of one hand, and what is painted on it
 
 
 class Renderer:
@@ -35,13 +37,13 @@ class Renderer:
 
     def __init__(self, scene: Scene, camera: str) -> None:
         """Prepare all (some 0.1 s); CalibrationError: no such camera, no such colour."""
-        self._view = View(scene, camera)
+        self._painters = tuple(Painter(View(one, camera)) for one in (scene, *scene.others))
+        self._view = self._painters[0].view
         optics = self._view.optics
         place = scene.rig.cameras.index(camera)
         self._size = (optics.width_px, optics.height_px)
         self._desk = desk_image(optics, DESK_DEPTH_M, scene.seed)
         self._noise = NoiseTiles(optics.height_px, optics.width_px, scene.seed * 64 + place)
-        self._painter = Painter(self._view)
         self._skin = light.shades(light.SKIN_LINEAR_RGB, gloss=0.01)
         self._sleeve = light.shades(light.SLEEVE_LINEAR_RGB)
         self._light = scene.light
@@ -57,8 +59,8 @@ class Renderer:
                 file that the scene was made with. The noise stays as it is.
         """
         other = copy(self)
-        other._view = self._view.exposed(exposure_us)
-        other._painter = Painter(other._view)
+        other._painters = tuple(Painter(one.view.exposed(exposure_us)) for one in self._painters)
+        other._view = other._painters[0].view
         other._gains_bgr = np.array(gains_bgr, dtype=np.float64)
         return other
 
@@ -67,31 +69,55 @@ class Renderer:
         return self._draw(t_s)[0]
 
     def markers(self, t_s: float) -> MarkerView:
-        """Truth of that frame, without the image."""
-        snapshot = self._view.snapshot(t_s)
-        return self._painter.truth(self._painter.cover(snapshot, self._view.cards(snapshot)), snapshot)
+        """Truth of that frame, of the first hand, without the image."""
+        return self._truth(self._cover(t_s)[0])[0]
 
     def observe(self, t_s: float) -> tuple[Image, MarkerView]:
-        """Image and truth of one frame."""
-        image, painted, snapshot = self._draw(t_s)
-        return image, self._painter.truth(painted, snapshot)
+        """Image of one frame, and its truth of the first hand."""
+        image, hands = self.observe_all(t_s)
+        return image, hands[0]
 
-    def _draw(self, t_s: float) -> tuple[Image, list[Painted], Snapshot]:
-        """Image of one frame, and what is painted in it."""
-        snapshot = self._view.snapshot(t_s)
-        cards = self._view.cards(snapshot)
-        painted = self._painter.cover(snapshot, cards)
+    def observe_all(self, t_s: float) -> tuple[Image, tuple[MarkerView, ...]]:
+        """Image of one frame, and its truth of each hand."""
+        image, hands = self._draw(t_s)
+        return image, self._truth(hands)
+
+    def _truth(self, hands: list[_Shown]) -> tuple[MarkerView, ...]:
+        return tuple(
+            painter.truth(painted, snapshot)
+            for painter, (snapshot, painted) in zip(self._painters, hands, strict=True)
+        )
+
+    def _cover(self, t_s: float) -> tuple[list[_Shown], tuple[Shape, ...]]:
+        """What is seen of each hand, and the cards before them."""
+        snapshots = [painter.view.snapshot(t_s) for painter in self._painters]
+        cards = self._view.cards(snapshots[0])
+        shown: dict[int, _Shown] = {}
+        before: list[Shape] = []
+        for k in sorted(range(len(snapshots)), key=lambda k: _depth_m(snapshots[k])):
+            shown[k] = snapshots[k], self._painters[k].cover(snapshots[k], cards, before)
+            before += outlines_of(snapshots[k]) if len(snapshots) > 1 else []
+        return [shown[k] for k in range(len(snapshots))], cards
+
+    def _draw(self, t_s: float) -> tuple[Image, list[_Shown]]:
+        """Image of one frame, and what of each hand is in it."""
+        hands, cards = self._cover(t_s)
         image = self._desk.copy()
-        self._draw_hand(image, snapshot)
-        box = self._hand_box(snapshot, cards)
-        self._smear(image, box, snapshot)
-        if outlines := snapshot.tracked.outlines():
-            points = np.vstack(outlines)
-            box = around(box, self._box(points.min(axis=0) - 6.0, points.max(axis=0) + 6.0))
+        boxes: list[Box] = []
+        for snapshot, _ in sorted(hands, key=lambda one: -_depth_m(one[0])):
+            self._draw_hand(image, snapshot)
+            box = self._hand_box(snapshot, cards)
+            self._smear(image, box, snapshot)
+            if outlines := snapshot.tracked.outlines():
+                points = np.vstack(outlines)
+                box = around(box, self._box(points.min(axis=0) - 6.0, points.max(axis=0) + 6.0))
+            boxes.append(box)
         for card in cards:
             raster.fill(image, raster.fixed(card.corners), self._card)
-        windows = [self._painter.window(image, group, snapshot) for group in self._painter.clusters(painted)]
-        roi = image[box[1] : box[3], box[0] : box[2]]
+        painter, painted = self._painters[0], [item for _, every in hands for item in every]
+        windows = [painter.window(image, group) for group in painter.clusters(painted)]
+        left, top, right, bottom = reduce(around, boxes)
+        roi = image[top:bottom, left:right]
         cv2.GaussianBlur(roi, (3, 3), LENS_SIGMA_PX, dst=roi)
         for x, y, patch in windows:
             image[y : y + patch.shape[0], x : x + patch.shape[1]] = patch
@@ -101,7 +127,7 @@ class Renderer:
         if (gains_bgr != 1.0).any():
             image = np.asarray(cv2.LUT(image, gain_tables(gains_bgr).T[None]), dtype=np.uint8)
         self._noise.add_to(image, round(t_s * 1e6))
-        return image, painted, snapshot
+        return image, hands
 
     def _draw_hand(self, image: Image, snapshot: Snapshot) -> None:
         corners = raster.fixed(snapshot.outlines)
@@ -198,6 +224,11 @@ class Renderer:
             ay, ax = abs(dy) + dy // 2, abs(dx) + dx // 2
             a, b = (padded[y : y + height, x : x + width] for y, x in ((ay, ax), (ay - dy, ax - dx)))
             cv2.addWeighted(a, 0.5, b, 0.5, 0, roi)
+
+
+def _depth_m(snapshot: Snapshot) -> float:
+    """How far a hand's palm is from the camera."""
+    return float(snapshot.points[_PALM, 2].mean())
 
 
 def _fill(image: Image, fills: Iterable[tuple[Float, Colour]]) -> None:

@@ -105,6 +105,8 @@ class Scene:
         centre_m: Middle of the volume (3,), rig frame [m].
         light: How the light changes; None: as it was when the colours were calibrated.
         objects: Files of the objects that the rig names.
+        others: Scenes of the other hands before the same cameras, each with its hand's part of the rig.
+        watched: The whole rig, of all hands; None: of one hand, `rig` itself.
         optics, tracked: The cameras; the objects.
     """
 
@@ -117,6 +119,8 @@ class Scene:
     seed: int = STANDARD_SEED
     light: LightSchedule | None = None
     objects: Mapping[str, ObjectProfile] = field(default_factory=dict[str, ObjectProfile])
+    others: tuple["Scene", ...] = ()
+    watched: RigCalibration | None = None
     optics: Mapping[str, CameraModel] = field(init=False)
     tracked: TrackedObjects = field(init=False)
 

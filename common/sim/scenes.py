@@ -17,7 +17,7 @@ slowly moving. Place, pace, axes and order of the turns are drawn from the seed;
     53 - 60 s   wanders
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import overload
@@ -27,6 +27,7 @@ import numpy as np
 from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration
 from common.calibration.object_profile import ObjectProfile
+from common.calibration.rig import rigs_by_hand
 from common.errors import CalibrationError, PhalanxError
 from common.geometry.srgb import to_linear
 from common.geometry.transforms import axis_rotation, rigid, rotation_vector_to_matrix
@@ -48,7 +49,7 @@ from common.sim.people import HandRoutine, load_leap
 from common.sim.render import Renderer
 from common.sim.scene import Card, Scene, view_centre
 from common.sim.tracked import facing
-from common.sim.two_rigs import TWO_RIG_SCENES, two_rig_motion
+from common.sim.two_rigs import TWO_RIG_SCENES, TwoHands, two_rig_motion
 from common.sim.wrist.render import LIVE_STEP, LIVE_WRIST_RAD, WristRenderer
 from common.sim.wrist.scene import WRIST_NAMES, WristScene
 
@@ -153,7 +154,9 @@ class ObjectTravel(DriftingMotion):
         return rigid(rotation @ self._facing, place)
 
 
-NAMES = f"standard | lights | poses | hand-routine | object | leap:FILE.npz | {' | '.join(TWO_RIG_SCENES)}"
+TWO_HANDS = "hands"
+_MORE = " | ".join((*TWO_RIG_SCENES, TWO_HANDS))
+NAMES = f"standard | lights | poses | hand-routine | object | leap:FILE.npz | {_MORE}"
 VIEWS = f"{NAMES} | board | card"
 _LEAP = "leap:"
 _MOTIONS = {"poses": StudyPoses, "hand-routine": HandRoutine, "object": ObjectTravel}
@@ -166,13 +169,15 @@ def scene_by_name(
     hand: HandProfile,
     seed: int,
     objects: Mapping[str, ObjectProfile] | None = None,
+    others: Sequence[HandProfile] = (),
 ) -> Scene:
     """Return the scene of the given name.
 
     `standard`, the same under light that changes (`lights`), the six poses of the Digits study (`poses`), a
     hand that follows the guided routine of `calibrate hand` (`hand-routine`), one beside a tracked object
     that travels (`object`), one that moves as in front of a wrist device at the same time (`TWO_RIG_SCENES`), or
-    one that follows a recorded motion. `objects`: files of the objects that the rig names.
+    one that follows a recorded motion. `objects`: files of the objects that the rig names. `others`: those of its
+    `other_hands`, in that order; such a rig sees two hands that cross (`hands`), which is its `standard`, too.
 
     Raises:
         PhalanxError: No such scene; a rig, camera, hand or object that does not fit; a recording that cannot
@@ -182,6 +187,8 @@ def scene_by_name(
         raise PhalanxError(
             f"scene {name!r}: shows markers, and rig {rig.name!r} is of kind {rig.kind!r}; that has {WRIST_NAMES}"
         )
+    if rig.other_hands:
+        return _of_hands(name, rig, cameras, (hand, *others), seed)
     if name in ("standard", "lights"):
         scene = Scene.standard(rig, cameras, hand, seed, objects)
         return scene if name == "standard" else replace(scene, light=ROOM)
@@ -198,6 +205,27 @@ def scene_by_name(
     return Scene.of_motion(rig, cameras, hand, motion, seed, objects, cards)
 
 
+def _of_hands(
+    name: str,
+    rig: RigCalibration,
+    cameras: Mapping[str, CameraCalibration],
+    hands: Sequence[HandProfile],
+    seed: int,
+) -> Scene:
+    """Scene of a rig of several hands; raises as `scene_by_name`."""
+    if name not in (TWO_HANDS, "standard"):
+        raise PhalanxError(f"scene {name!r}: shows one hand, rig {rig.name!r} watches several: {TWO_HANDS}")
+    profiles = dict(zip((rig.hand, *rig.other_hands), hands, strict=True))
+    parts = rigs_by_hand(rig, profiles)
+    first, *more = (
+        Scene.of_motion(
+            own, cameras, profiles[one], TwoHands(HandModel.of(profiles[one]), view_centre(rig), seed), seed
+        )
+        for one, own, _ in parts
+    )
+    return replace(first, others=tuple(more), watched=rig)
+
+
 def view_by_name(
     name: str,
     rig: RigCalibration,
@@ -205,6 +233,7 @@ def view_by_name(
     hand: HandProfile,
     seed: int,
     objects: Mapping[str, ObjectProfile] | None = None,
+    others: Sequence[HandProfile] = (),
 ) -> Scene | BoardScene | WristScene:
     """Return the scene of the given name that a simulated camera looks at.
 
@@ -220,7 +249,7 @@ def view_by_name(
         return CardScene(rig, cameras, seed)
     if rig.kind == "wrist":
         return WristScene.by_name(name, rig, cameras, hand, seed)
-    return scene_by_name(name, rig, cameras, hand, seed, objects)
+    return scene_by_name(name, rig, cameras, hand, seed, objects, others)
 
 
 @overload

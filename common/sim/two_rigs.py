@@ -1,4 +1,4 @@
-"""Motions that a marker rig and a wrist device see together.
+"""Motions that a marker rig and a wrist device see together, and of two hands.
 
 Fusion is measured on them, and extrinsics are calibrated from them.
 
@@ -11,6 +11,10 @@ device sits on the forearm (`common.hand.wrist`; limits of the bend as flexion /
     both-travel   the hand goes to and fro at a peak of 1 m/s, its fingers slowly moving; +-8 / +-5
     gestures      pinches, knobs, keys, pointing and free motion for 75 s (`gestures`); +-5 / +-3
     both-moves    10 s in which fingers bend one by one and together, the palm turns about all axes; +-25 / +-12
+
+`TwoHands`: a right and a left hand before one marker rig, 20 s. Middles of their palms pass at 0.1 m in depth, one hand
+and then the other in front, lie side by side at 0.1 m, and one hides the other for half a second; the left hand leaves
+and comes back on the other side.
 """
 
 from collections.abc import Callable, Mapping
@@ -31,6 +35,7 @@ from common.sim.motion import (
     StudyPoses,
     Waves,
     closing,
+    smooth_step,
     station_at,
     window,
 )
@@ -133,6 +138,50 @@ class Moves(DriftingMotion):
         )
         state = self._state(posture, wobble, shift, rotation)
         return replace(state, wrist_angles_rad=np.radians(MOVES_WRIST_DEG) * wave[6:])
+
+
+APART_M, NEAR_M, CROSS_M = 0.13, 0.0525, 0.05  # half distances: to the side, where they are nearest, in depth
+AWAY_M = np.array([0.0, 0.42, 0.0])
+_WAYS: dict[str, tuple[tuple[float, float, float], ...]] = {  # from, until [s], value afterwards
+    # right hand to the right 1 ... left of the left hand -1
+    "side": (
+        *((1.5, 3.0, -1.0), (4.0, 5.0, -NEAR_M / APART_M), (5.6, 6.6, -1.0), (7.4, 8.6, 1.0)),
+        *((10.0, 11.0, 0.0), (11.5, 12.5, 1.0), (14.0, 15.0, -1.0), (17.2, 18.6, 1.0)),
+    ),
+    "front": ((6.4, 7.4, -1.0), (8.6, 9.8, 1.0)),  # right hand in front of the left one 1 ... behind it -1
+    "away": ((13.0, 14.0, 1.0), (15.0, 16.0, 0.0)),  # of the left hand
+}
+
+
+class TwoHands(DriftingMotion):
+    """One of two hands that cross; its side is that of the hand."""
+
+    period_s = 20.0
+
+    def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
+        self._right = 1.0 if model.profile.side == "right" else -1.0
+        rng = np.random.default_rng([seed, 41, int(self._right) + 1])
+        super().__init__(model, centre_m, rng, self.period_s)
+        self._fingers, self._rotations = Waves(rng, 5, self.period_s), Waves(rng, 3, self.period_s)
+
+    def _moved(self, t: float, wobble: Float, shift: Float, rotation: Float) -> HandState:
+        side, front, away = _way("side", 1.0, t), _way("front", 1.0, t), _way("away", 0.0, t)
+        far_m = 0.06  # from the middle of the view, so that both hands are in it
+        shift = 0.3 * shift + np.array(
+            [self._right * side * APART_M, 0.0, far_m - self._right * front * CROSS_M]
+        )
+        rotation_deg = 10.0
+        rotation = rotation + np.radians(rotation_deg) * self._rotations.at(t)
+        if self._right < 0.0:
+            shift = shift + away * AWAY_M
+        return self._state(closing(0.12 + 0.12 * self._fingers.at(t)), wobble, shift, rotation)
+
+
+def _way(name: str, value: float, t_s: float) -> float:
+    """Value of a course at a time [s], which begins with `value`."""
+    for start_s, stop_s, end in _WAYS[name]:
+        value += (end - value) * smooth_step((t_s - start_s) / (stop_s - start_s))
+    return value
 
 
 _MOTIONS: Mapping[str, Callable[[HandModel, Float, int], HandMotion]] = {

@@ -320,6 +320,15 @@ class Places:
         return cls(middles, depth, low - REACH_PX, high + REACH_PX, behind_palm, phalanx)
 
 
+def outlines_of(snapshot: Snapshot) -> list[Shape]:
+    """Outlines of all of a hand: phalanges, caps, palm and sleeve."""
+    speed = 0.5 * snapshot.speed_uv[CAPSULES].sum(axis=1)
+    solid = [*zip(snapshot.outlines[:, 0], speed, strict=True)]
+    solid += [(raster.hull(uv), snapshot.palm_speed) for uv in snapshot.cap_uv]
+    solid += [(one[0], snapshot.palm_speed) for one in (snapshot.palm, snapshot.web, snapshot.sleeve)]
+    return [Shape(corners, way) for corners, way in solid]
+
+
 def hand_before(snapshot: Snapshot, places: Places) -> list[list[Shape]]:
     """Outlines of phalanges, sleeve and palm that may occlude each marker."""
     speed = 0.5 * snapshot.speed_uv[CAPSULES].sum(axis=1)

@@ -41,17 +41,22 @@ class Truth:
     visible: Float  # (N, C, M) visible share of each marker in each camera
 
 
-def load_truth(folder: Path, shown: Bool) -> Truth | None:
-    """Truth of a rendered recording; None where the folder holds none.
+def load_truth(folder: Path, shown: Bool, hand: str | None = None) -> Truth | None:
+    """Truth of a rendered recording; None where the folder holds none of this hand.
 
-    `shown`: (M,) markers found most often; a sweep of the depth shows a single flat one.
+    `shown`: (M,) markers found most often; a sweep of the depth shows a single flat one. `hand`: None: the first.
 
     Raises:
         RecordingError: truth.npz is broken, lacks an array, or leads out of the folder.
     """
     if not has_truth(folder):
         return None
-    data = read_truth(folder, also=(*_OF_SWEEP, *_OF_HAND))
+    own = {key: key if hand is None else f"{key}_{hand}" for key in _OF_HAND}
+    data = read_truth(folder, also=(*_OF_SWEEP, *own.values()))
+    if hand is not None:
+        if own["joints"] not in data:
+            return None
+        data = {key: data[name] for key, name in own.items() if name in data}
     try:
         truth = _sweep(data, shown) if "depth" in data else _hand(data)
         _check(truth, len(shown))

@@ -196,18 +196,22 @@ def _summarise(
     """Counts, and scores where the recording carries the truth of this hand."""
     seen = sum(bool(pose.valid.any()) for pose in poses)
     summary: dict[str, object] = {"poses": len(poses), "poses_valid": seen}
-    if not poses or setup.rig.hand != recording.manifest.rig_named(None).hand:
+    if not poses:
         return summary
     stacked = Poses.of(poses)
+    if setup.rig.hand != recording.manifest.rig_named(None).hand:
+        return summary | _score_markers(recording, setup, stacked, setup.rig.hand)
     if setup.has_markers:
         summary |= _score_markers(recording, setup, stacked)
     return summary | _score_wrist(recording, setup, messages, stacked)
 
 
-def _score_markers(recording: FrameRecording, setup: RigSetup, poses: Poses) -> dict[str, float]:
+def _score_markers(
+    recording: FrameRecording, setup: RigSetup, poses: Poses, hand: str | None = None
+) -> dict[str, float]:
     """Score a hand with markers, also where cameras lose what a wrist device sees."""
     found = np.isfinite(poses.markers_raw_m).all(axis=2).sum(axis=0)
-    truth = load_truth(recording.folder, found == found.max())
+    truth = load_truth(recording.folder, found == found.max(), hand) if found.size else None
     if truth is None:
         return {}
     scores = score(poses, truth, fingers_of(setup))

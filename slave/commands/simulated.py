@@ -124,10 +124,11 @@ def world_of(
 
 def scene_of(calibration: Path, rig: RigCalibration, name: str, seed: int) -> Scene | BoardScene | WristScene:
     """The scene `name` before a rig's cameras, from files of a calib_json tree."""
-    hand = load(calibration / "hands" / f"{rig.hand}.json", HandProfile)
+    names = rig.hand, *rig.other_hands
+    hand, *others = (load(calibration / "hands" / f"{n}.json", HandProfile) for n in names)
     cameras = {n: load(calibration / "cameras" / f"{n}.json", CameraCalibration) for n in rig.cameras}
     objects = {n: load(calibration / "objects" / f"{n}.json", ObjectProfile) for n in rig.objects}
-    return view_by_name(name, rig, cameras, hand, seed, objects)
+    return view_by_name(name, rig, cameras, hand, seed, objects, others)
 
 
 def imu_of(camera: str, calibration: Path, rig: RigCalibration, name: str, seed: int) -> SimulatedImu:
