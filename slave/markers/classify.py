@@ -35,10 +35,11 @@ SKIN = HsvRange(hsv_low=(174, 60, 70), hsv_high=(22, 190, 255))
 class ColourTable:
     """Look-up table from a colour to the markers it may belong to.
 
-    Bit m of an entry belongs to marker m, the bit after the last marker to skin. Tables made of it for another light
-    share the entries.
+    A bit of an entry belongs to a range, the bit after the last to skin. Tables made of it for another light share the
+    entries.
 
     Attributes:
+        bits: Of each marker; those of one paint, on two hands, share one.
         entries: (2^24,) codes of 1, 2, 4 or 8 bytes, at the sum of the `places` of blue, green and red.
         places: (3, 256) what each byte of blue, green and red adds to the index.
     """
@@ -47,10 +48,11 @@ class ColourTable:
         """Build the table of 1 to 63 HSV ranges in marker order (0.1 s); else ValueError."""
         if not 1 <= len(ranges) <= 63:
             raise ValueError(f"{len(ranges)} colour ranges, from 1 to 63 are possible")
-        self.count = len(ranges)
-        self.bits = tuple(1 << m for m in range(self.count))
-        self.skin = 1 << self.count
-        self.entries = _build([*ranges, SKIN])
+        distinct = {(one.hsv_low, one.hsv_high): one for one in ranges}
+        order = list(distinct)
+        self.bits = tuple(1 << order.index((one.hsv_low, one.hsv_high)) for one in ranges)
+        self.skin = 1 << len(order)
+        self.entries = _build([*distinct.values(), SKIN])
         self.places = _places(np.tile(np.arange(256, dtype=np.uint8), (3, 1)))
         self._bytes: Image | None = None  # (3, 256); None: as they are
         self._coarse: Codes | None = None  # for the scan, where they are others

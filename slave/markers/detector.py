@@ -1,6 +1,8 @@
 """Marker detector: frame in, marker centroids out.
 
-A push machine. It holds one track per marker; a new recording gets a new detector (`fresh`).
+A push machine. It holds one track per marker; a new recording gets a new detector (`fresh`). Markers of one paint, on
+two hands, share a colour: which of its blobs is whose tracks decide as far as they go, and else the master. Where two
+of them may have become one blob, neither is reported.
 
     scan     one table look-up, all colours at once; the whole frame or windows    scan, classify
     blobs    connected blobs per colour                                            classify
@@ -27,7 +29,7 @@ from slave.markers.group import (
     Candidate,
     ColourAmbiguityMonitor,
     candidate,
-    choose,
+    choose_all,
     connected,
     on_fringe,
 )
@@ -40,6 +42,7 @@ from slave.markers.track import (
     Track,
     Window,
     advance,
+    assigned,
     centre_of,
     fits_occlusion,
     sigma_of,
@@ -126,6 +129,11 @@ class MarkerDetector:
         self._initial_uv = {
             markers.index(name): uv for name, uv in (initial_uv or {}).items() if name in markers
         }
+        rows_of: dict[int, list[int]] = {}
+        for m, bit in enumerate(self.table.bits):
+            rows_of.setdefault(bit, []).append(m)
+        self._colours = list(rows_of.values())  # rows of each colour: of one marker, or of one on every hand
+        self._alike = [rows_of[bit] for bit in self.table.bits]
         self._tracks: list[Track | None] = [None] * len(markers)
         self._scanner = Scanner(camera.width_px, camera.height_px, engine)
         self._last_ns: int | None = None  # time of the last frame
@@ -158,6 +166,7 @@ class MarkerDetector:
         scanned = self._look(image, t_ns, windows)
         blobs = scanned.blobs
         chosen = self._decide(scanned, windows)
+        blobs = [self._but_of_others(m, options, chosen) for m, options in enumerate(blobs)]
         self.ambiguity.push(blobs, chosen)
         self._initial_uv = {}
         rows = list(chosen)
@@ -168,13 +177,15 @@ class MarkerDetector:
                 track = alive[m]
                 known = (math.inf, math.nan) if track is None else (track.extent, track.whole)
                 chosen[m], shift_px[m] = with_fragments(chosen[m], blobs[m], *known)
-                alternative = self._alternative(m, chosen[m], blobs, windows[m])
+                alternative = self._alternative(
+                    chosen[m], blobs[m], self._foreign(m, scanned.blobs), windows[m]
+                )
                 if alternative is not None:
                     alternatives[m] = alternative
         # An alternative costs as much as a marker, so only two are measured in one frame.
         closely = sorted(alternatives, key=lambda m: -alternatives[m].area)[:2]
         asked = [(m, chosen[m]) for m in rows] + [(m, alternatives[m]) for m in closely]
-        alone = [len(blobs[m]) == 1 or _alone(blob, blobs[m]) for m, blob in asked]
+        alone = [len(every) == 1 or _alone(blob, every) for m, blob in asked for every in [scanned.blobs[m]]]
         bits = [self.table.bits[m] for m, _ in asked]
         measured = self._engine.measure(image, self.table, bits, [blob for _, blob in asked], alone)
         for m, seen in zip(closely, measured[len(rows) :], strict=True):
@@ -187,6 +198,8 @@ class MarkerDetector:
             for m, seen in zip(rows, measured, strict=False)
             if seen is not None and not (seen.thin and (seen.foreign > fringe or seen.area < sliver))
         }
+        for m in [m for m, seen in seen_as.items() if self._merged(m, seen, chosen, windows)]:
+            del seen_as[m]
         self.evidence, self._frame = {}, self._frame + 1
         due = {m for m in seen_as if alive[m] is None}
         outlines = outlines_of(image, seen_as, due, self._outlined, self._frame)
@@ -270,20 +283,48 @@ class MarkerDetector:
         blue, green, red = seen.colour
         return u, v, area, quality, sigma, *other, clarity, blue, green, red
 
-    def _alternative(self, m: int, blob: Blob, blobs: list[list[Blob]], window: Window | None) -> Blob | None:
+    def _alternative(
+        self, blob: Blob, options: list[Blob], foreign: list[Blob], window: Window | None
+    ) -> Blob | None:
         """Return the largest other blob that may be the marker by size and motion."""
         alternative = 0.3  # of the marker's area: a smaller blob is no alternative, nor one as much larger
         least, most = alternative * blob.area, blob.area / alternative
-        foreign = [b for n, rest in enumerate(blobs) if n != m for b in rest[:1]]
         others = (
             b
-            for b in blobs[m]
+            for b in options
             if least < b.area < most
             and not blob.holds(b.u, b.v)
             and (window is None or math.isfinite(window.cost(b)))
             and not on_fringe(b, foreign)
         )
         return max(others, key=lambda b: b.area, default=None)
+
+    def _foreign(self, m: int, blobs: list[list[Blob]]) -> list[Blob]:
+        """The largest blobs of the other colours, as many as there are markers of each."""
+        return [b for rows in self._colours if m not in rows for b in blobs[rows[0]][: len(rows)]]
+
+    def _but_of_others(self, m: int, options: list[Blob], chosen: Mapping[int, Blob]) -> list[Blob]:
+        """The blobs of a marker's colour without those of its like on other hands."""
+        if len(self._alike[m]) == 1:
+            return options
+        taken = [chosen[n] for n in self._alike[m] if n != m and n in chosen]
+        return [blob for blob in options if all(blob is not other for other in taken)]
+
+    def _merged(
+        self, m: int, seen: Measured, chosen: Mapping[int, Blob], windows: list[Window | None]
+    ) -> bool:
+        """Whether a blob may hold its like of another hand, too, that is not seen."""
+        track, blob = self._tracks[m], chosen[m]
+        reach = 0.5 * math.sqrt(blob.area)  # how far off the place may be at which that is expected
+        largest = 1.12  # of the area of late: more is not of this marker alone
+        return any(
+            n not in chosen
+            and (window := windows[n]) is not None
+            and blob.holds(window.u, window.v, reach)
+            and (track is None or seen.area > largest * track.typical)
+            for n in self._alike[m]
+            if n != m
+        )
 
     def _look(self, image: Image, t_ns: int, windows: list[Window | None]) -> Scanned:
         """Scan the frame as far as it has to be."""
@@ -309,43 +350,50 @@ class MarkerDetector:
         blobs = scanned.blobs
         tracked: dict[int, Blob] = {}
         certain = not self._initial_uv
-        for m, options in enumerate(blobs):
-            track, window = self._tracks[m], windows[m]
+        for rows in self._colours:
+            options = blobs[rows[0]]
             if not options:
                 continue
-            if track is None or window is None:
-                certain = False
-                continue
-            cost, k = min((window.cost(blob), k) for k, blob in enumerate(options))
-            if math.isfinite(cost):
-                tracked[m] = options[k]
-            certain &= math.isfinite(cost) and not track.sudden(options[k])
+            known = {m: window for m in rows if (window := windows[m]) is not None}
+            found = assigned(known, options) if known else {}
+            tracked |= found
+            certain &= len(found) == min(len(rows), len(options))
+            certain &= not any(self._sudden(m, blob) for m, blob in found.items())
         if certain and connected([blob for m, blob in tracked.items() if m not in self._free]):
             return tracked
         candidates: list[Candidate] = []
-        for m, options in enumerate(blobs):
-            others = [blob for n, rest in enumerate(blobs) if n != m for blob in rest[:1]]
-            for blob in options:
-                bonus = self._bonus(m, blob, tracked.get(m))
+        for m, *more in self._colours:
+            others = self._foreign(m, blobs)
+            for blob in blobs[m]:
+                bonus = max(self._bonus(n, blob, tracked.get(n)) for n in (m, *more))
                 skin = scanned.skin_share(self.table.skin, blob)
                 candidates.append(candidate(m, blob, skin, on_fringe(blob, others), bonus))
         clicked = {c.marker for c in candidates if c.bonus >= CLICKED}
         candidates = [c for c in candidates if c.bonus >= CLICKED or c.marker not in clicked]
-        chosen = choose([c for c in candidates if c.marker not in self._free])
+        slots = {rows[0]: len(rows) for rows in self._colours}
+        chosen: dict[int, Blob] = {}
+        for c in choose_all([c for c in candidates if c.marker not in self._free], slots):
+            rows = [m for m in self._alike[c.marker] if m not in chosen]
+            own = [m for m in rows if tracked.get(m) is c.blob]
+            chosen[(own or [m for m in rows if m not in tracked] or rows)[0]] = c.blob
         for m in self._free:
             # One that was tracked is followed; one that appears is the largest that is no rim of another colour.
             mine = [c for c in candidates if c.marker == m and (c.bonus > 0.0 or not c.fringe)]
             if mine:
-                chosen[m] = max(mine, key=lambda c: (c.bonus, c.blob.area))
-        return {m: c.blob for m, c in chosen.items()}
+                chosen[m] = max(mine, key=lambda c: (c.bonus, c.blob.area)).blob
+        return chosen
+
+    def _sudden(self, m: int, blob: Blob) -> bool:
+        """Whether a marker's area jumped."""
+        track = self._tracks[m]
+        return track is not None and track.sudden(blob)
 
     def _bonus(self, m: int, blob: Blob, tracked: Blob | None) -> float:
         initial_uv = self._initial_uv.get(m)
         click_reach = 6  # px between a click and the scanned box of its marker
         if initial_uv is not None and blob.holds(*initial_uv, click_reach):
             return CLICKED + math.sqrt(blob.area)  # the click names it; of its fragments take the largest
-        track = self._tracks[m]
-        return TRACKED if blob is tracked and track is not None and not track.sudden(blob) else 0.0
+        return TRACKED if blob is tracked and not self._sudden(m, blob) else 0.0
 
 
 def _alone(blob: Blob, options: list[Blob]) -> bool:

@@ -24,6 +24,7 @@ SKIN_REACH = 0.8  # how much farther, relatively, skin around both lets them be
 SPECK = 24.0  # px^2; smaller blobs are rarely markers
 CLICKED = 10.0  # bonus of the blob that the user clicked: it outweighs every alternative of its marker
 TRACKED = 1.0  # bonus of the blob where the marker is expected: as much as being there
+SECOND_HAND = 3  # markers of a group beside the first from which it is a hand
 SKINLESS = 0.06  # caps on rendered hands have 0.12 and more
 
 
@@ -79,7 +80,7 @@ def choose(candidates: Sequence[Candidate]) -> dict[int, Candidate]:
     """Choose the markers among the candidates: marker row -> candidate.
 
     A marker without a plausible blob is absent. The best group is a hand; markers that it lacks may be on a second
-    hand, a group of at least `second_hand` markers with skin. Less than that is clutter that happens to lie together.
+    hand, a group of at least `SECOND_HAND` markers with skin. Less than that is clutter that happens to lie together.
     """
     links = _links(candidates)
     rest = set(range(len(candidates)))
@@ -102,10 +103,26 @@ def choose(candidates: Sequence[Candidate]) -> dict[int, Candidate]:
     second = [candidates[i] for i in _best_group(candidates, links, free)]
     second = [c for c in second if c.blob.area >= SPECK or c.bonus >= TRACKED]
     solid = [c for c in second if c.skin >= 2.0 * SKINLESS or c.bonus >= TRACKED]
-    second_hand = 3  # markers
-    if len(solid) >= second_hand:
+    if len(solid) >= SECOND_HAND:
         markers = {c.marker for c in solid}
         found |= {c.marker: c for c in second if c.marker in markers or not _strange(c, solid)}
+    return found
+
+
+def choose_all(candidates: Sequence[Candidate], slots: Mapping[int, int]) -> list[Candidate]:
+    """Choose the markers of all hands; `slots`: how many markers a row stands for.
+
+    Markers on a further hand, painted alike, are those of a group that is one by itself, or tracked.
+    """
+    found = list(choose(candidates).values())
+    for hand in range(1, max(slots.values(), default=1)):
+        taken = {id(c.blob) for c in found}
+        rest = [c for c in candidates if slots.get(c.marker, 1) > hand and id(c.blob) not in taken]
+        group = list(choose(rest).values())
+        solid = [
+            c for c in group if c.blob.area >= SPECK and (c.skin >= 2.0 * SKINLESS or c.bonus >= TRACKED)
+        ]
+        found += [c for c in group if len(solid) >= SECOND_HAND or c.bonus >= TRACKED]
     return found
 
 

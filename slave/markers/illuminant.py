@@ -256,6 +256,8 @@ def evidence(half: Image, table: ColourTable, reference: Float, log_gains: Float
     codes = table.codes(undone(half, log_gains))
     colour = np.full(reference.shape, np.nan)
     for m, bit in enumerate(table.bits):
+        if bit in table.bits[:m]:
+            continue  # of the same paint on another hand: it proves nothing more
         if seen := _colours(half, ((codes & bit) != 0).astype(np.uint8)):
             expected = np.log(reference[m]) + log_gains
             colour[m] = min(seen, key=lambda c: float(np.ptp(np.log(c) - expected)))

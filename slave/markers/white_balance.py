@@ -136,10 +136,12 @@ class ColourMonitor:
     def _ambiguous(self) -> list[ColourWarning]:
         hue = (self._mean[:, 0] + self._middle) % HUES
         separation = hue_distance(hue[:, None], hue)
+        span = np.column_stack([self._middle, self._half])
+        other = (span[:, None] != span).any(axis=-1)  # hands painted alike share their ranges
         long = self._monitored_s >= LEAST_S
         with np.errstate(invalid="ignore"):
             # hues: two marker colours nearer than this look the same
-            near = (separation < 8.0) & long[:, None] & long[None, :]
+            near = (separation < 8.0) & other & long[:, None] & long[None, :]
         return [
             ColourWarning(
                 self._names[a],
