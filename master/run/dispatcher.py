@@ -32,6 +32,7 @@ from master.gestures.poses import GestureRecogniser
 from master.objects.contact import ContactMonitor
 from master.objects.line import ObjectLine, SolvedObject
 from master.objects.tracker import TrackerLine, registered
+from master.rig.alike import AlikeHands
 from master.rig.pipeline import Pipeline, pipeline_of
 from master.rig.setup import RigSetup
 from master.run.app import Solved, StageTimes
@@ -131,6 +132,7 @@ class _Auxiliary:
         shown: Camera -> the objects that it may see.
         trackers: Tracker -> the object that it sits on.
         contacts, gestures: Hand -> what detects that of it.
+        alike: What tells the markers of hands apart that are painted alike; None: there are none.
     """
 
     objects: tuple[TrackedObject, ...]
@@ -138,6 +140,7 @@ class _Auxiliary:
     trackers: dict[str, TrackedObject]
     contacts: dict[str, ContactMonitor]
     gestures: dict[str, GestureRecogniser]
+    alike: AlikeHands | None
 
     @classmethod
     def of(cls, setups: Sequence[RigSetup], counts: Counter[str], *, gestures: bool) -> "_Auxiliary":
@@ -163,6 +166,7 @@ class _Auxiliary:
             {name: GestureRecogniser(setup.gestures, setup.hand) for name, setup in hands.items()}
             if gestures
             else {},
+            AlikeHands.of(setups, counts),
         )
 
 
@@ -229,10 +233,17 @@ class Dispatcher:
                 line.push_orientation(message.t_ns, message.orientation_wxyz, message.heading_sigma_rad)
             return
         poses: list[SolvedPose] = []
+        alike = self._now.alike
+        if alike is not None and isinstance(message, MarkerDetections):
+            with self._stage("association"):
+                message = alike.push(message)
         if isinstance(message, _FRAMES):
             for own, line in self._watching.get(message.camera, ()):
                 poses += line.push(message if own is None else own(message))
             yield from poses
+        if alike is not None:
+            for one in poses:
+                alike.take(one.pose)
         if self._now.objects:
             yield from self._seen(message)
         if self._now.contacts or self._now.gestures:
