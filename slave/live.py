@@ -15,6 +15,7 @@ from msgspec.structs import replace
 from common.arrays import Image
 from common.calibration import CameraCalibration, RigCalibration
 from common.calibration.camera_settings import ColourPick
+from common.calibration.rig import painted_alike
 from common.errors import CameraError
 from common.hand.model import FINGERS
 from slave.markers.colours import SampledColours
@@ -56,7 +57,10 @@ class ColourSampler:
     ) -> tuple[CameraCalibration, Mapping[str, float]]:
         """The camera file with the clicked colour; its pixels and what its range holds."""
         every = camera.markers or {}
-        ranges = {name: every[name] for name in self._markers if name in every}
+        first = painted_alike(
+            (request.marker, *self._markers)
+        )  # hands are painted alike: one is picked for all
+        ranges = {name: every[name] for name in self._markers if name in every and first[name] == name}
         adaptive = self._detector.adaptive
         light = np.zeros(3) if adaptive is None else adaptive.log_gains
         made, row = self._picked.sample(self._image(request.t_ns), light, request.marker, request.uv, ranges)
@@ -66,6 +70,7 @@ class ColourSampler:
             "pick.skin_share": row.skin,
             "pick.background_px": row.background_px,
         }
+        made |= {name: made[one] for name, one in first.items() if one in made}
         return replace(camera, markers=every | made), report
 
     def _image(self, t_ns: int | None) -> Image:

@@ -36,6 +36,7 @@ from common.calibration.camera_settings import (
 )
 from common.calibration.files import MonitoredFiles, Provenance, date_now
 from common.calibration.object_profile import ObjectProfile
+from common.calibration.rig import unsided
 from common.errors import CalibrationError, PhalanxError
 from slave.sources import Reporting, Tunable
 
@@ -51,7 +52,8 @@ def in_use(camera: CameraCalibration, markers: tuple[str, ...]) -> dict[str, flo
     found = {"width_px": float(camera.width_px), "height_px": float(camera.height_px)}
     found |= {f"colour.{name}"[:_NAME]: _number(colour) for name, colour in ranges.items()}
     for (one, first), (other, second) in combinations(ranges.items(), 2):
-        if hues := overlap(first, second):
+        alike = unsided(one) == unsided(other) and _number(first) == _number(second)  # of two hands
+        if not alike and (hues := overlap(first, second)):
             found[f"overlap.{one}..{other}"[:_NAME]] = float(hues)
     return found
 

@@ -95,6 +95,7 @@ class Posture(Part, frozen=True):
 
 
 Preset = Literal["K", "D"]
+Side = Literal["left", "right"]
 Finger = Literal["thumb", "index", "middle", "ring", "little"]
 PalmarScale = Annotated[float, Meta(ge=0.5, le=2.0)]
 
@@ -110,7 +111,7 @@ class HandProfile(Part, frozen=True):
 
     version: Literal[1]
     name: Name
-    side: Literal["left", "right"]
+    side: Side
     rest_joints: Annotated[dict[str, RestJoint], Meta(max_length=64)]
     markers: Annotated[dict[Name, MarkerMount], Meta(max_length=MAX_MARKERS)]
     radius_m: dict[str, Thickness] | None = None

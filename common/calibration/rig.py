@@ -4,7 +4,7 @@ What belongs to a wrist device is in the frame of its camera (OpenCV axes).
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Annotated, Literal, get_args
 
@@ -29,7 +29,7 @@ from common.calibration.files import (
     Vector3,
     check_quaternion,
 )
-from common.calibration.hand import Finger, HandProfile
+from common.calibration.hand import Finger, HandProfile, Side
 from common.calibration.object_profile import check_pose
 from common.calibration.strobe import StrobeCalibration, check_strobe
 from common.errors import CalibrationError
@@ -329,6 +329,17 @@ def _check_imu(imu: ImuCalibration, cameras: tuple[str, ...], where: str) -> Non
     for key, value in (("q_palm_imu", imu.q_palm_imu), ("q_rig_world", imu.q_rig_world)):
         if value is not None:
             check_quaternion(value, f"{where}: imu.{key}")
+
+
+def unsided(marker: str) -> str:
+    """The marker on any hand: `thumb` of `left_thumb`; what is called alike may be painted alike."""
+    side, _, name = marker.partition("_")
+    return name if name and side in get_args(Side) else marker
+
+
+def painted_alike(markers: Sequence[str]) -> dict[str, str]:
+    """Marker -> the first that may be painted like it: itself, or that of another hand."""
+    return {marker: next(one for one in markers if unsided(one) == unsided(marker)) for marker in markers}
 
 
 def rigs_by_hand(

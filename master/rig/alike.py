@@ -1,4 +1,4 @@
-"""Markers of two hands painted alike are told apart by where each hand is expected.
+"""Hands painted alike are told apart by where each is expected.
 
 A slave names the blobs of a paint in no particular order. Of each camera's frame, before it goes to the hands' lines:
 each hand's markers are expected where its last pose and their velocity have them, with the pose's covariance and
@@ -14,7 +14,7 @@ agree, the hand is not published.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from typing import NamedTuple
@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from common.arrays import Float, Int
+from common.arrays import Bool, Float, Int
 from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import quaternion_to_matrix
@@ -42,11 +42,13 @@ class AlikeSettings(NamedTuple):
 
     absent: float = 30.0  # cost of a blob for a hand that is not there
     most: float = 45.0  # of a blob that is not where the hand is expected
-    clear: float = 9.0  # by which a way must be better: 90 to 1
+    change: float = 4.0  # of a marker that comes or goes: one frame in twenty
+    clear: float = 6.0  # by which a way must be better: 20 to 1
     known_s: float = 0.7  # after a pose; then the hand is not there
     velocity_s: float = 0.1  # between poses from which a velocity is taken
-    acceleration_m_s2: float = 20.0  # of a marker, standard deviation
-    place_m: float = 0.005  # by which the part of a cap that is seen lies off its centroid, at most about
+    acceleration_m_s2: float = 15.0  # of a marker, standard deviation
+    sigma_px: float = 1.0  # of a blob that states none
+    place_m: float = 0.003  # by which the part of a cap that is seen lies off its centroid, at most about
     begin_m: float = 0.015  # of points of two frames that are not of one instant
     apart_periods: float = 1.5  # between the frames of two cameras that show one hand
     meet_px: float = 8.0  # by which their rays may miss each other: 1 m/s between the frames
@@ -66,6 +68,15 @@ _WAYS = {
     -2: np.array([[1, _LEFT], [_LEFT, 1], [_LEFT, _LEFT]]),
     2: np.array([[0, 1], [1, 0]]),
 }
+
+
+def _minus_2_log(d: Float, S: Float, most: Float) -> Float:
+    """-2 log likelihood (K, n), but for a constant, of d (K, n, m) with covariance S.
+
+    `most`: (K, 1), what replaces a greater one; 0 where d is NaN.
+    """
+    cost = ((d @ np.linalg.inv(S)) * d).sum(axis=-1) + np.linalg.slogdet(S)[1][:, None]
+    return np.where(np.isfinite(d[..., 0]), np.minimum(cost, most), 0.0)
 
 
 @dataclass(slots=True)
@@ -115,12 +126,15 @@ class _Hand:
         out[marker] = points_m
         return out
 
-    def costs(self, camera: "_Watching", h: int, t_ns: int, uv: Float, sigma_px: Float) -> Float:
-        """What each blob (K, 2) costs this hand, the rig's hand `h`."""
-        marker, model = camera.marker[:, h], camera.model
-        points, cov = self.points_m[marker], self.cov_m2[marker]
+    def expected(self, frame: "_Frame", h: int) -> tuple[Float, Float, Float]:
+        """Where a frame's paints are of this hand, the rig's hand `h`.
+
+        Returns pixels (K, 2), their derivative (K, 2, 3) [px/m] and the covariance (K, 3, 3) [m^2] of the point.
+        """
+        marker, model = frame.camera.marker[:, h], frame.camera.model
+        points = self.points_m[marker]
         assert self.t_ns is not None
-        tau = (t_ns + model.row_time_ns * np.nan_to_num(model.project(points)[:, 1]) - self.t_ns) * 1e-9
+        tau = (frame.t_ns + model.row_time_ns * np.nan_to_num(model.project(points)[:, 1]) - self.t_ns) * 1e-9
         ahead = np.clip(tau, -ALIKE.velocity_s, ALIKE.velocity_s)
         points = points + ahead[:, None] * self.velocity_m_s[marker]
         process = ALIKE.place_m**2 + (0.5 * ALIKE.acceleration_m_s2 * tau**2) ** 2
@@ -128,15 +142,35 @@ class _Hand:
         x, y, z = (R @ (points - model.centre).T).clip([[-np.inf], [-np.inf], [0.01]])
         J = np.zeros((len(points), 2, 3))
         J[:, 0, 0], J[:, 0, 2], J[:, 1, 1], J[:, 1, 2] = 1.0 / z, -x / z**2, 1.0 / z, -y / z**2
-        J = float(model.matrix[0, 0]) * J @ R
-        S = (J @ (cov + process[:, None, None] * np.eye(3)) @ J.transpose(0, 2, 1))[:, None]
-        S = S + (sigma_px**2)[..., None, None] * np.eye(2)
-        a, b, c = S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]
-        dx, dy = np.moveaxis(uv - model.project(points)[:, None], -1, 0)
-        det = a * c - b * b
-        cost = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / det + np.log(det)
-        expected = np.isfinite(points[:, 0] + cov[:, 0, 0])[:, None]
-        return np.where(expected, np.minimum(cost, ALIKE.most), ALIKE.absent)
+        cov = self.cov_m2[marker] + process[:, None, None] * np.eye(3)
+        # a marker of which nothing is known is expected nowhere near
+        return np.nan_to_num(model.project(points), nan=1e4), float(model.matrix[0, 0]) * J @ R, cov
+
+    def costs(self, now: "_Frame", other: "_Frame | None", h: int) -> Float:
+        """What it costs that this hand's are blob i of `now` and blob j of `other`.
+
+        Returns (K, 3, 3); i or j 2: none, which costs nothing.
+        """
+        expected, J, cov = self.expected(now, h)
+        off, sigma2 = (now.uv - expected[:, None])[:, :, None].repeat(2, axis=2), now.variance_px2[:, None]
+        if other is not None:
+            expected, J_there, _ = self.expected(other, h)
+            there = (other.uv - expected[:, None])[:, None].repeat(2, axis=1)
+            off, J = np.concatenate([off, there], axis=-1), np.concatenate([J, J_there], axis=1)
+            sigma2 = np.stack([now.variance_px2, other.variance_px2], axis=1)
+        S = J @ cov @ J.transpose(0, 2, 1) + np.eye(J.shape[1]) * sigma2.repeat(2, axis=1)[:, None]
+        known = np.isfinite(S.sum(axis=(1, 2)))[:, None, None]
+        off = np.where(known[..., None] | np.isnan(off), off, 1e4)
+        S, absent = np.where(known, S, np.eye(J.shape[1])), np.where(known, np.inf, ALIKE.absent)
+        C = np.zeros((len(off), 3, 3))
+        C[:, :2, 2] = _minus_2_log(off[:, :, 0, :2], S[:, :2, :2], np.minimum(absent[..., 0], ALIKE.most))
+        if other is not None:
+            C[:, 2, :2] = _minus_2_log(off[:, 0, :, 2:], S[:, 2:, 2:], np.minimum(absent[..., 0], ALIKE.most))
+            both = _minus_2_log(off.reshape(-1, 4, 4), S, 2.0 * absent[..., 0]).reshape(-1, 2, 2)
+            apart = ALIKE.most + np.minimum(C[:, :2, 2:], C[:, 2:, :2])  # one of them is something else
+            here, away = np.isfinite(off[..., 0]), np.isfinite(off[..., 2])
+            C[:, :2, :2] = np.where(here & away, np.minimum(both, apart), C[:, :2, 2:] + C[:, 2:, :2])
+        return C
 
     def side_of(self, points_m: Float, towards: Float) -> float:
         """How surely points (M, 3) are of this hand's side, 1, or of the other's, -1.
@@ -167,11 +201,12 @@ class _Watching:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Left:
-    """Blobs (K, 2) of a frame that are no known hand's; NaN: none."""
+class _Frame:
+    """Two blobs of each paint in one camera's frame; NaN: none."""
 
     t_ns: int
     uv: Float  # (K, 2, 2)
+    variance_px2: Float  # (K,)
     camera: _Watching
 
 
@@ -201,7 +236,9 @@ class AlikeHands:
                 model, late_ns, place, np.array(rows).reshape(-1, 2), np.array(pairs).reshape(-1, 2)
             )
         self._period_ns = max(1e9 / one.frame_rate_hz for one in setups[0].cameras.values())
-        self._left: dict[str, _Left] = {}
+        self._left: dict[int, _Frame] = {}  # camera -> what was over in its last frame
+        self._last: dict[int, _Frame] = {}
+        self._seen: dict[int, Bool] = {}  # camera -> (K, 2) whether it saw each hand's marker of a paint
         self._lean, self._lean_ns, self._lean_places = 0.0, 0, np.zeros((2, 3))
 
     @classmethod
@@ -228,15 +265,25 @@ class AlikeHands:
         camera = self._watching.get(message.camera)
         if camera is None or not len(camera.slots):
             return message
-        t_ns = message.t_ns + camera.late_ns
         uv, sigma = message.uv[camera.slots], message.sigma_px[camera.slots]
-        owner = self._owners(camera, t_ns, uv, sigma)
-        if not all(known := self._known(t_ns)):
+        variance = np.nan_to_num(sigma, nan=ALIKE.sigma_px).max(axis=1) ** 2
+        now = _Frame(message.t_ns + camera.late_ns, uv, variance, camera)
+        owner = self._owners(now)
+        if not all(known := self._known(now.t_ns)):
             left = np.where((owner == _LEFT)[..., None], uv, np.nan)
-            self._left[message.camera] = _Left(t_ns, left, camera)
-            if self._begin(self._left[message.camera], known):
-                owner = self._owners(camera, t_ns, uv, sigma)
+            self._left[camera.place] = _Frame(now.t_ns, left, variance, camera)
+            if self._begin(self._left[camera.place], known):
+                owner = self._owners(now)
+        self._last[camera.place] = now
         return self._ordered(message, camera, owner)
+
+    def _beside(self, frames: Mapping[int, _Frame], now: _Frame) -> _Frame | None:
+        """The nearest frame of another camera; None: too long ago, or of other paints."""
+        others = [one for place, one in frames.items() if place != now.camera.place]
+        other = min(others, key=lambda one: abs(one.t_ns - now.t_ns), default=now)
+        near = abs(other.t_ns - now.t_ns) <= ALIKE.apart_periods * self._period_ns
+        alike = np.array_equal(other.camera.marker, now.camera.marker)
+        return other if near and alike and other is not now else None
 
     def take(self, pose: HandPose) -> None:
         """Take a pose of one of the hands, or of another."""
@@ -246,22 +293,35 @@ class AlikeHands:
     def _known(self, t_ns: int) -> list[bool]:
         return [h.t_ns is not None and abs(t_ns - h.t_ns) <= ALIKE.known_s * 1e9 for h in self._hands]
 
-    def _owners(self, camera: _Watching, t_ns: int, uv: Float, sigma_px: Float) -> Int:
+    def _owners(self, now: _Frame) -> Int:
         """Whose each blob (K, 2) is: a hand's, `_LEFT` over, or `_UNCLEAR`."""
-        known = self._known(t_ns)
+        known, other = self._known(now.t_ns), self._beside(self._last, now)
         ways = _WAYS[sum(known) if sum(known) != 1 else -1 - known.index(True)]
-        cost = np.full((*uv.shape[:2], 3), ALIKE.absent)  # by blob, of the hands and of none
+        seen, row = np.isfinite(now.uv[..., 0]), np.arange(len(now.uv))
+        left = (ways == _LEFT).astype(np.float64).T * ALIKE.absent
+        total = (seen @ left)[..., None]  # (K, ways, ways in the other frame)
+        if other is not None:
+            total = total + (np.isfinite(other.uv[..., 0]) @ left)[:, None]
+        own = np.zeros((*seen.shape, 2))
         for h, hand in enumerate(self._hands):
             if known[h]:
-                cost[..., h] = hand.costs(camera, h, t_ns, uv, sigma_px)
-        seen = np.isfinite(uv[..., 0])
-        cost = np.where(seen[..., None], cost, 0.0)
-        total = cost[:, 0, ways[:, 0]] + cost[:, 1, ways[:, 1]]  # (K, ways)
+                cost = hand.costs(now, other, h)
+                own[..., h] = cost[:, :2, 2]
+                blob = np.where((ways == h).any(axis=1), (ways == h).argmax(axis=1), 2)
+                total = total + (cost[:, blob][:, :, blob] if other is not None else cost[:, blob, 2:])
+        total = total.min(axis=2)
+        was = self._seen.setdefault(now.camera.place, np.zeros(seen.shape, np.bool_))
+        shows = ((ways[None, ..., None] == (0, 1)) & seen[:, None, :, None]).any(axis=2)  # (K, ways, 2 hands)
+        total += ALIKE.change * (shows != was[:, None]).sum(axis=2)
         best = total.argmin(axis=1)
         # ways that give the blobs that are there to the same hands are one
-        other = ((ways[None] != ways[best][:, None]) & seen[:, None]).any(axis=2)
-        second = np.where(other, total, np.inf).min(axis=1)
-        clear = second - total[np.arange(len(best)), best] >= ALIKE.clear
+        differs = ((ways[None] != ways[best][:, None]) & seen[:, None]).any(axis=2)
+        second = np.where(differs, total, np.inf).min(axis=1)
+        clear = second - total[row, best] >= ALIKE.clear
+        if all(known):  # blobs that are all where no hand is expected say nothing
+            fits = np.take_along_axis(own, ways[best][..., None], axis=2)[..., 0] < ALIKE.most
+            clear &= (seen & fits).any(axis=1)
+        was[clear] = shows[row, best][clear]
         self._counts["alike.unclear"] += int((seen & ~clear[:, None]).sum())
         return np.where(clear[:, None], ways[best], _UNCLEAR)
 
@@ -281,12 +341,9 @@ class AlikeHands:
             array[source < 0] = np.nan
         return replace(message, **fields)
 
-    def _begin(self, now: _Left, known: Sequence[bool]) -> bool:
+    def _begin(self, now: _Frame, known: Sequence[bool]) -> bool:
         """Let hands that are not known begin with what is left over, if that is clear."""
-        near_ns = ALIKE.apart_periods * self._period_ns
-        others = [one for one in self._left.values() if one.camera is not now.camera]
-        other = min(others, key=lambda one: abs(one.t_ns - now.t_ns), default=now)
-        if other is now or abs(other.t_ns - now.t_ns) > near_ns:
+        if (other := self._beside(self._left, now)) is None:
             return False
         groups, marker = self._groups(now, other, 2 - sum(known))
         if not np.isfinite(groups).any():
@@ -322,23 +379,22 @@ class AlikeHands:
         self._lean = 0.0
         return True
 
-    def _groups(self, now: _Left, other: _Left, hands: int) -> tuple[Float, Int]:
+    def _groups(self, now: _Frame, other: _Frame, hands: int) -> tuple[Float, Int]:
         """Points (2, K, 3) [m] of two hands in two frames, and their markers (K, 2).
 
         NaN: not seen. All NaN: nothing, or it is not clear what belongs together.
         """
-        there = other.camera.marker.tolist()
-        here = [k for k, marker in enumerate(now.camera.marker.tolist()) if marker in there]
-        marker = now.camera.marker[here]
-        uv = np.full((len(self._centres), len(here), 2, 2, 2), np.nan)  # camera, paint, blob here, blob there
-        uv[now.camera.place] = now.uv[here][:, :, None]
-        uv[other.camera.place] = other.uv[[there.index(one) for one in marker.tolist()]][:, None]
+        marker = now.camera.marker
+        uv = np.full(
+            (len(self._centres), len(marker), 2, 2, 2), np.nan
+        )  # camera, paint, blob here, blob there
+        uv[now.camera.place], uv[other.camera.place] = now.uv[:, :, None], other.uv[:, None]
         found = triangulate(self._cameras, uv.reshape(len(uv), -1, 2), 1.0)
         met = np.where((found.residual_px < ALIKE.meet_px)[:, None], found.points_m, np.nan)
-        options = [_options(one, hands) for one in met.reshape(len(here), 2, 2, 3)]
+        options = [_options(one, hands) for one in met.reshape(len(marker), 2, 2, 3)]
         if first := next((some for some in options if len(some) > 1 and hands == 2), None):
             del first[len(first) // 2 :]  # the rest is the same with the groups in the other order
-        unclear = np.full((2, len(here), 3), np.nan), marker
+        unclear = np.full((2, len(marker), 3), np.nan), marker
         count = np.prod([len(some) for some in options])
         most = 20_000
         if not 0 < count <= most:
@@ -355,7 +411,11 @@ class AlikeHands:
         best, *rest = np.sort(spread)[:2].tolist()
         if rest and rest[0] - best < ALIKE.ambiguous_m2:
             return unclear
-        return points[spread.argmin()], marker
+        groups = points[spread.argmin()]
+        lone = np.isnan(groups[..., 0]).any(axis=0) & np.isfinite(groups[..., 0]).any(axis=1).all()
+        return np.where(
+            lone[:, None], np.nan, groups
+        ), marker  # of two hands, what one shows alone may be the other's
 
 
 def _options(P: Float, hands: int) -> list[Float]:

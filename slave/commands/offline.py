@@ -19,6 +19,7 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.calibration import CameraCalibration, HandProfile, load, save
+from common.calibration.rig import painted_alike
 from common.command_line import UsageError, echo, remark
 from common.errors import CalibrationError, RecordingError
 from common.recording.frame_recording import MANIFEST, FrameRecording, FrameRow, load_manifest, open_recording
@@ -143,7 +144,8 @@ def calibrate_colours(
     """Make the colour ranges of one camera from a recording; write its camera file.
 
     With clicks, from the clicked colours of the first frame. Without, or where `auto`, `like` or `hand` ask for it,
-    from what moves with the hand in all frames.
+    from what moves with the hand in all frames. Hands of one rig are painted alike: colours of the first hand's
+    markers are those of the others', too.
 
     Args:
         folder: Recording. Its `clicks` name one pixel per marker in the camera's first frame, or none.
@@ -169,7 +171,9 @@ def calibrate_colours(
             f"--click: rig {rig.name!r} has no marker {unknown[0]!r}; it has {', '.join(rig.markers)}"
         )
     clicks = {**recording.manifest.clicks.get(camera, {}), **(clicks or {})}
-    missing = [name for name in rig.markers if name not in clicks]
+    first = painted_alike(rig.markers)
+    names = tuple(dict.fromkeys(first.values()))
+    missing = [name for name in names if name not in clicks]
     moving = auto or like is not None or hand is not None or not clicks
     if missing and not moving:
         raise RecordingError(
@@ -180,25 +184,26 @@ def calibrate_colours(
     pictures = FramePictures(folder, (own.width_px, own.height_px))
     if not moving:
         image = pictures.read(rows[0].file)
-        table = calibrate(image, {name: clicks[name] for name in rig.markers})
+        table = calibrate(image, {name: clicks[name] for name in names})
     else:
         profile = Path("calib_json/hands") / f"{rig.hand}.json" if hand is None else hand
         if like is not None:
-            namer = by_hues(load(like, CameraCalibration).markers, rig.markers, str(like), notify)
+            namer = by_hues(load(like, CameraCalibration).markers, names, str(like), notify)
             if hand is not None or profile.exists():
                 shape = load(profile, HandProfile)
-                if hand is not None or shape.markers.keys() >= set(rig.markers):
-                    namer = checked(namer, by_hand(shape, rig.markers, notify), notify)
+                if hand is not None or shape.markers.keys() >= set(names):
+                    namer = checked(namer, by_hand(shape, names, notify), notify)
         elif hand is None and not missing:
-            namer = by_clicks(clicks, rig.markers, own.width_px)
+            namer = by_clicks(clicks, names, own.width_px)
         else:
-            namer = by_hand(load(profile, HandProfile), rig.markers, notify)
+            namer = by_hand(load(profile, HandProfile), names, notify)
         chosen = spread(len(rows), frames_for(own.width_px * own.height_px))
         notify(f"{camera}: reading {len(chosen)} of {len(rows)} frames")
         images = [pictures.read(rows[k].file) for k in chosen]
-        table = calibrate_moving(images, rig.markers, namer, notify)
+        table = calibrate_moving(images, names, namer, notify)
     make_folder(output.parent)
-    save(output, msgspec.structs.replace(own, markers={row.name: row.range for row in table}))
+    made = {row.name: row.range for row in table}
+    save(output, msgspec.structs.replace(own, markers={name: made[one] for name, one in first.items()}))
     return table
 
 
