@@ -9,10 +9,10 @@ everybody else is refused with what to do. A refusal, and a slave that is gone, 
 """
 
 import argparse
-import grp
 import logging
 import os
 import queue
+import select
 import socket
 import struct
 import threading
@@ -20,7 +20,6 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from io import BufferedRWPair
 from pathlib import Path
-from socketserver import ThreadingUnixStreamServer
 
 import msgspec
 import numpy as np
@@ -33,8 +32,6 @@ from common.command_line import remark
 from common.errors import CameraError, PhalanxError
 from common.machine import ROOT
 from common.recording.frame_recording import Illumination, Manifest
-from slave.cameras.v4l2 import device_path
-from slave.cameras.v4l2_controls import TIMEOUT_S
 from slave.drivers import SERVICE
 from slave.reconnect import ReconnectingDriver
 from slave.sources import Frame, FrameSource
@@ -45,6 +42,7 @@ _HEADER, _LENGTH = struct.Struct("<4q2d4I"), struct.Struct("<I")
 _LIT = tuple(Illumination)
 _OPENED = ("lights", "luma", "sync", "control", "clock_offset_ms", "clock_ppm")  # how a camera is opened
 _NO_SETTING = frozenset({"intrinsics", "markers", "roi_margin", "provenance"})  # of a camera file
+_WAIT_S = 2.0  # for a frame, as for that of a camera
 _LOG = logging.getLogger(__name__)
 
 
@@ -118,6 +116,8 @@ class FrameServer:
         self._readers: tuple[_Reader, ...] = ()  # replaced whole: the loop walks it without the lock
         folder = os.environ.get("RUNTIME_DIRECTORY")  # of a service, by systemd
         for path in [Path(folder) / "frames"] if folder else _places(name)[1:]:
+            from socketserver import ThreadingUnixStreamServer  # not on Windows
+
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.unlink(missing_ok=True)  # of a slave that died
@@ -178,6 +178,8 @@ class FrameServer:
 
     def _offer(self, end: socket.socket) -> tuple[str, Offer]:
         """Who asks, by the kernel, and the answer."""
+        import grp  # not on Windows
+
         pid, user, group = struct.unpack("3i", end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
         peer_groups, most = 59, 2  # SO_PEERGROUPS of Linux; readers
         groups = {group, *memoryview(end.getsockopt(socket.SOL_SOCKET, peer_groups, 1024)).cast("I")}
@@ -186,7 +188,10 @@ class FrameServer:
         if user not in (0, os.geteuid()) and not groups & video:
             how = "`sudo usermod -aG video $USER`, then log in again; or use sudo"
             return who, Offer(f"its frames are for root and group video: {how}")
-        if len(self._readers) >= most:
+        gone = select.select([reader.end for reader in self._readers], [], [], 0.0)[
+            0
+        ]  # one sends nothing more
+        if len(self._readers) - len(gone) >= most:
             return who, Offer(f"{most} programs read its frames already: end one of them")
         try:
             return who, Offer(opened=self._opened, manifest=self._manifest())
@@ -197,6 +202,8 @@ class FrameServer:
 def _places(name: str) -> list[Path]:
     """Where a service has its socket; then, in a session, a slave of its user."""
     folders = [os.environ.get(ROOT, "/") + "/run", os.environ.get("XDG_RUNTIME_DIR")]
+    if not hasattr(socket, "AF_UNIX"):  # Windows
+        return []
     return [Path(folder) / "phalanx" / name / "frames" for folder in folders if folder]
 
 
@@ -247,7 +254,7 @@ class SharedCamera:
             if self._file.readinto(data) == count:
                 return data
         except TimeoutError as error:
-            raise CameraError(f"{self._slave}: no frame for {TIMEOUT_S:g} s: its camera is away") from error
+            raise CameraError(f"{self._slave}: no frame for {_WAIT_S:g} s: its camera is away") from error
         except OSError as error:
             raise CameraError(f"{self._slave}: {error.strerror}") from error
         raise CameraError(f"{self._slave} has ended, or given this reader up: its log states why")
@@ -256,7 +263,7 @@ class SharedCamera:
 def _connected(name: str) -> BufferedRWPair:
     for path in _places(name):
         with socket.socket(socket.AF_UNIX) as end:
-            end.settimeout(TIMEOUT_S)
+            end.settimeout(_WAIT_S)
             try:
                 end.connect(str(path))
                 return end.makefile("rwb")
@@ -320,5 +327,7 @@ def _device(driver: str) -> str:
     """The device of a real camera; empty: it is none."""
     kind, _, place = driver.partition(":")
     if kind == "v4l2":
+        from slave.cameras.v4l2 import device_path  # not on Windows
+
         return os.path.realpath(device_path(place))
     return f"{kind}:{place or 0}" if kind == "picamera2" else ""

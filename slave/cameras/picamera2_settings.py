@@ -24,7 +24,7 @@ import numpy.typing as npt
 from common.calibration import CameraCalibration
 from common.errors import CameraError
 from slave.cameras.grey import Pixels
-from slave.cameras.settings import Setting, as_values, users_of
+from slave.cameras.settings import Setting, as_values
 
 INSTALL = (
     "install it with `sudo apt install python3-picamera2 --no-install-recommends` (Raspberry Pi OS, 64 bit) and make "
@@ -128,6 +128,8 @@ def open_library(index: int) -> tuple[Library, Enums]:
     try:
         library = cast(Library, picamera2.Picamera2(index))
     except RuntimeError as error:
+        from slave.cameras.v4l2_abi import users_of  # of Linux, as is libcamera
+
         raise CameraError(
             f"--camera picamera2:{index}: cannot be opened ({error.__cause__ or error}); "
             f"{users_of(Path('/dev/media*'))}; else restart the Pi"

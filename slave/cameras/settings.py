@@ -7,12 +7,9 @@ up.
 """
 
 import math
-import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Generic, TypeVar
 
 from common.calibration import CameraCalibration
@@ -96,29 +93,6 @@ def change(
 
 def _text_of(values: Sequence[float], unit: str) -> str:
     return ", ".join(f"{value:.6g}" for value in values) + (f" {unit}" if unit else "")
-
-
-def users_of(device: Path) -> str:
-    """Which other programs have a device (its name may be a pattern), and what to do.
-
-    By the locks that libcamera has on the media devices it uses (`MediaDevice::lock`), which everybody may read; else
-    by who has a device open, of which only root sees all.
-    """
-    paths = {path.resolve() for path in device.parent.glob(device.name)}
-    locks = [line.split() for line in Path("/proc/locks").read_text().splitlines()]
-    inodes = {str(path.stat().st_ino) for path in paths}
-    pids = {words[4] for words in locks if words[5].rpartition(":")[2] in inodes}
-    users: list[str] = []
-    for process in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):  # it has ended, or is somebody else's
-            opened = not pids and any(link.resolve() in paths for link in process.glob("fd/*"))
-            if (opened or process.name in pids) and process.name != str(os.getpid()):
-                words = (process / "cmdline").read_text(errors="replace").replace("\0", " ").strip()
-                unit = (process / "cgroup").read_text().strip().rpartition("/")[2]
-                users.append(f"`{words[:80]}` (process {process.name} of {unit or 'no service'})")
-    if users:
-        return f"another program has it: {', '.join(users)}: end that"
-    return f"another program may have it: `sudo fuser -v {device}` names it"
 
 
 T = TypeVar("T")

@@ -35,7 +35,7 @@ from common.clock import Clock
 from common.errors import CameraError
 from slave.cameras import v4l2_abi as abi
 from slave.cameras.grey import Pixels
-from slave.cameras.settings import FrameObserver, change, users_of
+from slave.cameras.settings import FrameObserver, change
 from slave.cameras.v4l2_controls import SETTLE_FRAMES, TIMEOUT_S, V4l2Settings
 from slave.cameras.v4l2_formats import Layout, Offer, choose_offer, read_offers, set_format
 from slave.clocks import ForeignClock, clock_of, system_clock
@@ -97,7 +97,7 @@ class V4l2Camera(Tunable):
             raise CameraError(f"{self._where}: {error}") from error
         except OSError as error:
             self.close()
-            who = f"; {users_of(options.path)}" if error.errno == errno.EBUSY else ""
+            who = f"; {abi.users_of(options.path)}" if error.errno == errno.EBUSY else ""
             raise CameraError(f"{self._where}: cannot be started: {error.strerror}{who}") from error
 
     def read(self) -> Frame | None:

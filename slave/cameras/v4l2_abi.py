@@ -11,6 +11,7 @@ import fcntl
 import mmap
 import os
 import select
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -268,3 +269,27 @@ def fourcc(text: str) -> int:
 def fourcc_text(number: int) -> str:
     """The four letters of a pixel format."""
     return number.to_bytes(4, "little").decode("ascii", "replace").strip()
+
+
+def users_of(device: Path) -> str:
+    """Which other programs have a device (its name may be a pattern), and what to do.
+
+    By the locks that libcamera has on the media devices it uses (`MediaDevice::lock`), which everybody may read; else
+    by who has a device open, of which only root sees all.
+    """
+    paths = {path.resolve() for path in device.parent.glob(device.name)}
+    pids, users = set[str](), list[str]()
+    with suppress(OSError):
+        locks = [line.split() for line in Path("/proc/locks").read_text().splitlines()]
+        inodes = {str(path.stat().st_ino) for path in paths}
+        pids = {words[4] for words in locks if words[5].rpartition(":")[2] in inodes}
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has ended, or is somebody else's
+            opened = not pids and any(link.resolve() in paths for link in process.glob("fd/*"))
+            if (opened or process.name in pids) and process.name != str(os.getpid()):
+                words = (process / "cmdline").read_text(errors="replace").replace("\0", " ").strip()
+                unit = (process / "cgroup").read_text().strip().rpartition("/")[2]
+                users.append(f"`{words[:80]}` (process {process.name} of {unit or 'no service'})")
+    if users:
+        return f"another program has it: {', '.join(users)}: end that"
+    return f"another program may have it: `sudo fuser -v {device}` names it"

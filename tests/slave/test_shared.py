@@ -19,7 +19,7 @@ import pytest
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import CalibrationError, CameraError
 from common.recording.frame_recording import Illumination, Manifest
-from slave.cameras.settings import users_of
+from slave.cameras.v4l2_abi import users_of
 from slave.cli.table import PROGRAM
 from slave.raw import RawProbe
 from slave.shared import FrameServer, SharedCamera, opened_by, shared_camera
@@ -163,6 +163,7 @@ def test_readers_that_are_gone_are_forgotten_and_a_third_is_refused(slave: Slave
         SharedCamera("left")
     one.close()
     other.close()
+    SharedCamera("left").close()  # served, though no frame has shown yet that the two are gone
 
     def gone() -> bool:
         slave.server.offer(frames(1)[0])
