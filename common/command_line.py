@@ -36,14 +36,13 @@ def remark(text: str) -> None:
     echo(text, error=True)
 
 
-# What is written for Linux alone, by `sys.platform`; tests/test_portable.py holds that nothing else is.
-_NOT_ON = "phalanx demo, run --install and fleet; v4l2 and picamera2 cameras, lights and IMUs on I2C"
-_NOT_HERE = {
-    "darwin": f"macOS (nobody has tried it yet) lacks {_NOT_ON}, the same-user check of a console without password",
-    "win32": f"Windows (nobody has tried it yet) lacks {_NOT_ON}, IMUs on a serial port, trackers of libsurvive, the "
-    "same-user check of a console without password, the check that others cannot read keys, and an orderly end of what "
-    "the console starts",
-}
+# What is written for Linux alone, by `sys.platform`; tests/elsewhere.py lists its files.
+_NOT_HERE = dict.fromkeys(
+    ("darwin", "win32"), "cameras on USB or a Pi, I2C, lights, demo, run --install, fleet"
+)
+_NOT_HERE["win32"] += (
+    ", IMUs on serial ports, libsurvive, private files of keys, an orderly end of what console starts"
+)
 
 
 def check_system(platform: str, utf8_mode: int) -> None:
@@ -56,8 +55,10 @@ def check_system(platform: str, utf8_mode: int) -> None:
         raise PhalanxError(
             "set PYTHONUTF8=1: files of Phalanx are UTF-8, this Python would read them otherwise"
         )
-    if platform in _NOT_HERE:
-        remark(f"{_NOT_HERE[platform]}; cameras on USB: --camera opencv:INDEX")
+    if missing := _NOT_HERE.get(platform):
+        remark(
+            f"{platform}: nobody has tried it yet; not here: {missing}, a check of who opens a console without password"
+        )
 
 
 DONE, FAILED, WRONG_USAGE = 0, 1, 2

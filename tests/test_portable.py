@@ -103,7 +103,8 @@ def test_a_rig_is_tracked_and_what_is_not_there_is_said(
     assert summary["poses_per_s"] > 1.0
     for name in ("left", "right", "master"):
         assert (
-            "Windows (nobody has tried it yet) lacks phalanx demo" in (tmp_path / f"{name}.log").read_text()
+            "win32: nobody has tried it yet; not here: cameras on USB"
+            in (tmp_path / f"{name}.log").read_text()
         )
 
 
@@ -112,8 +113,8 @@ def test_a_rig_is_tracked_and_what_is_not_there_is_said(
     [
         ("linux", ""),
         ("freebsd15", ""),
-        ("darwin", "macOS (nobody has tried it yet) lacks phalanx demo, run --install and fleet; v4l2"),
-        ("win32", "an orderly end of what the console starts"),
+        ("darwin", "darwin: nobody has tried it yet; not here: cameras on USB or a Pi, I2C, lights, demo"),
+        ("win32", "an orderly end of what console starts"),
     ],
 )
 def test_the_first_line_names_what_a_system_lacks(
@@ -123,6 +124,15 @@ def test_the_first_line_names_what_a_system_lacks(
     said = capsys.readouterr().err
     assert words in said
     assert said.count("\n") == (1 if words else 0)
+
+
+def test_a_driver_of_linux_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PHALANX_RIG_KEY", 64 * "1")
+    monkeypatch.setenv("PHALANX_OPEN", "1")
+    rig = ["--name", "left", "--rig", "desk", "--calibration", str(ROOT / "calib_json")]
+    done = elsewhere("slave", "run", *rig, "--camera", "v4l2")
+    assert done.returncode == 1, done.stderr
+    assert done.stderr.splitlines()[-1] == "phalanx-slave: fcntl is missing: this needs Linux"
 
 
 def test_windows_reads_files_as_utf_8_or_does_not_start() -> None:

@@ -81,9 +81,8 @@ def record_camera(options: argparse.Namespace) -> int:
             imu_recorder.keep()
     if imu is not None and done.frames:
         add_imu(options.output, imu, options.scene_epoch_ns, drivers.clock)
-    getattr(
-        os, "sync", lambda: None
-    )()  # what was reported as recorded is on the disk, also when the power goes now
+    # what was reported as recorded is on the disk, also when the power goes now
+    getattr(os, "sync", lambda: None)()
     if failure is None and imu_recorder is not None:
         failure = imu_recorder.failure
     if failure is not None:
