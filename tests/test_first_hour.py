@@ -41,7 +41,8 @@ def templates_of(source: str) -> list[Template]:
     found: list[Template] = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
-            found.append((node.value,))
+            pieces = node.value.split("HOST")  # of a hint of ssh
+            found.append(tuple(part for piece in pieces for part in (None, piece))[1:])
         elif isinstance(node, ast.JoinedStr):
             found.append(
                 tuple(str(one.value) if isinstance(one, ast.Constant) else None for one in node.values)
