@@ -37,7 +37,7 @@ def remark(text: str) -> None:
 
 
 # What is written for Linux alone, by `sys.platform`; tests/elsewhere.py lists its files.
-_NOT_HERE = dict.fromkeys(
+_NOT_HERE: dict[str, str] = dict.fromkeys(
     ("darwin", "win32"), "cameras on USB or a Pi, I2C, lights, demo, run --install, fleet"
 )
 _NOT_HERE["win32"] += (
