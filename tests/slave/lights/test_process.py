@@ -10,11 +10,16 @@ from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from common.clock import SkewedClock
-from common.errors import LightsError
-from slave.lights.strobed import StrobeProcess
+from common.clock import SkewedClock, SystemClock
+from common.errors import CameraError, LightsError
+from slave.cli.table import PROGRAM
+from slave.commands import devices
+from slave.commands.devices import Drivers
+from slave.lights.strobed import StrobedCamera, StrobeProcess
+from slave.sources import Frame, FrameSource
 from tests.slave.lights.stage import CAMERA, PERIOD_NS, RIG, ROOT
 
 LIGHTS = "gpio:0:17,27"
@@ -96,6 +101,52 @@ def test_lights_are_in_step_while_the_slave_computes(log: Path) -> None:
     # 180 exposures in 3 s, nine stamps and the last quarter of a second aside; a virtual machine may stop for a while
     assert whole > 100, counts
     assert part < 0.1 * whole, counts
+
+
+class Camera(FrameSource):
+    """Frames at the camera's rate, stamped when they were exposed."""
+
+    def __init__(self, own: SkewedClock) -> None:
+        self.own, self.first_ns, self.number, self.closed = own, own.now_ns(), 0, False
+
+    def read(self) -> Frame | None:
+        stamp_ns = self.first_ns + round(self.number * PERIOD_NS)
+        time.sleep(max((stamp_ns - self.own.now_ns()) * 1e-9, 0.0))
+        self.number += 1
+        return Frame(self.number, stamp_ns, self.own.now_ns(), np.zeros((2, 2), np.uint8))
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_the_camera_that_the_slave_opens_is_lit(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    own, options = (
+        clock(),
+        PROGRAM.parse(["run", "--rig", "wrist", "--camera", "v4l2", "--lights", LIGHTS])[1],
+    )
+    device = Camera(own)
+
+    def opened(*_: object, **__: object) -> FrameSource:
+        return device
+
+    monkeypatch.setattr(devices, "open_camera", opened)
+    camera = Drivers(options, RIG, own, SystemClock()).camera(CAMERA)
+    assert isinstance(camera, StrobedCamera)
+    deadline = time.monotonic() + 60.0
+    while camera.counts()["lights.pulses"] < 4 and time.monotonic() < deadline:
+        assert camera.read() is not None
+    camera.close()
+    assert device.closed
+    assert {which for _, which in switched(log)} == {"00", "10", "01"}
+    assert switched(log)[-1][1] == "00"
+    monkeypatch.setattr(devices, "open_camera", _unplugged)
+    with pytest.raises(CameraError, match="unplugged"):
+        Drivers(options, RIG, own, SystemClock()).camera(CAMERA)
+    assert switched(log)[-1][1] == "00"
+
+
+def _unplugged(*_: object, **__: object) -> FrameSource:
+    raise CameraError("unplugged")
 
 
 def test_what_cannot_be_opened_is_said_at_the_start(log: Path) -> None:
