@@ -80,16 +80,9 @@ class _Reader:
     def send_all(self) -> None:
         """Send frames until None comes; OSError: nobody takes them."""
         while (frame := self.waiting.get()) is not None:
-            stamps = (
-                frame.seq,
-                frame.t_ns,
-                frame.ready_t_ns,
-                self.dropped,
-                frame.t_sigma_ns,
-                frame.exposure_us,
-            )
-            shape = (*frame.image.shape, 0)[:3]
-            self.end.sendall(_HEADER.pack(*stamps, _LIT.index(frame.illumination), *shape))
+            stamps = frame.seq, frame.t_ns, frame.ready_t_ns, self.dropped
+            seen = frame.t_sigma_ns, frame.exposure_us, _LIT.index(frame.illumination)
+            self.end.sendall(_HEADER.pack(*stamps, *seen, *(*frame.image.shape, 0)[:3]))
             self.end.sendall(np.ascontiguousarray(frame.image).data)
             self.frames += 1
 
@@ -121,13 +114,13 @@ class FrameServer:
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.unlink(missing_ok=True)  # of a slave that died
-                self._server = ThreadingUnixStreamServer(str(path), self._serve)  # type: ignore[arg-type]
+                server = ThreadingUnixStreamServer(str(path), self._serve)  # type: ignore[arg-type]
                 path.chmod(0o666)  # the kernel states who asks
             except OSError as error:
                 _LOG.warning("%s: its frames are not shared: %s: %s", name, path, error.strerror or error)
                 return
-            self._server.daemon_threads = True
-            threading.Thread(target=self._server.serve_forever, name=f"{name} shared", daemon=True).start()
+            self._server, server.daemon_threads = server, True
+            threading.Thread(target=server.serve_forever, name=f"{name} shared", daemon=True).start()
 
     def offer(self, frame: Frame) -> None:
         """Queue a frame for all readers. Never waits."""
@@ -188,10 +181,9 @@ class FrameServer:
         if user not in (0, os.geteuid()) and not groups & video:
             how = "`sudo usermod -aG video $USER`, then log in again; or use sudo"
             return who, Offer(f"its frames are for root and group video: {how}")
-        gone = select.select([reader.end for reader in self._readers], [], [], 0.0)[
-            0
-        ]  # one sends nothing more
-        if len(self._readers) - len(gone) >= most:
+        ends = [reader.end for reader in self._readers]
+        gone, _, _ = select.select(ends, [], [], 0.0)  # readers send nothing, but their end
+        if len(ends) - len(gone) >= most:
             return who, Offer(f"{most} programs read its frames already: end one of them")
         try:
             return who, Offer(opened=self._opened, manifest=self._manifest())
@@ -232,9 +224,10 @@ class SharedCamera:
     def read(self) -> Frame:
         """The next frame."""
         if not self._asked:
-            self._file.write(b"+")
-            self._file.flush()
             self._asked = True
+            with suppress(OSError):  # it has ended, as the next line sees
+                self._file.write(b"+")
+                self._file.flush()
         header = _HEADER.unpack(self._bytes(_HEADER.size))
         seq, t_ns, ready_ns, self._dropped, sigma_ns, exposure_us, lit, *shape = header
         shape = shape if shape[2] else shape[:2]
