@@ -18,7 +18,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 OURS = ("common", "slave", "master", "deploy")
 # The only files that may ask for Linux: the demo's processes, hosts, services; drivers of the kernel's devices; which
-# boot a recording is of; whose a connection to a console without password is.
+# boot a recording is of; who has a camera, and may read its frames; who opens a console without password.
 LINUX = (
     "deploy/*",
     "slave/install/*",
@@ -28,8 +28,12 @@ LINUX = (
     "slave/cameras/v4l2*",
     "slave/objects/survive.py",
     "slave/recorder.py",
+    "slave/shared.py",
+    "slave/cameras/picamera2_settings.py",
     "master/console/serving.py",
 )
+# Of them those that ask when they run, and not when they are imported.
+LATE = ("slave/recorder.py", "slave/shared.py", "slave/cameras/picamera2_settings.py")
 MODULES = frozenset(
     ("fcntl", "grp", "posix", "pty", "pwd", "readline", "resource", "syslog", "termios", "tty")
 )
@@ -129,11 +133,7 @@ def refuse_places(event: str, arguments: tuple[Any, ...]) -> None:
 def modules() -> list[str]:
     """Names of all modules that may not ask for Linux."""
     files = (file.relative_to(ROOT) for one in OURS for file in sorted((ROOT / one).rglob("*.py")))
-    kept = (
-        file
-        for file in files
-        if not any(fnmatch(str(file), one) for one in LINUX if one != "slave/recorder.py")
-    )
+    kept = (file for file in files if str(file) in LATE or not any(fnmatch(str(file), one) for one in LINUX))
     return [
         ".".join(file.with_suffix("").parts)
         for file in kept
