@@ -39,7 +39,7 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "rerun_cli": ("master/outputs/rerun*.py",),
     "serial": ("slave/imu/*.py",),
     "smbus2": ("slave/imu/*.py", "slave/lights/*.py"),
-    "c3d": ("master/mocap/c3d_file.py",),
+    "c3d": ("master/mocap/read.py",),
     "gpiod": ("slave/lights/gpio*.py",),
     "picamera2": ("slave/cameras/picamera2*.py",),
     "libcamera": ("slave/cameras/picamera2*.py",),

@@ -10,10 +10,14 @@ The format is found by the file's name, length by its unit or the size of the ha
 """
 
 import re
+import struct
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, cast
 
+import c3d
 import numpy as np
 
 from common.arrays import Float
@@ -32,7 +36,6 @@ from master.mocap.bvh_file import (
     known,
     read_bvh,
 )
-from master.mocap.c3d_file import read_c3d
 from master.mocap.csv_file import read_csv
 
 _WORD = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
@@ -345,3 +348,44 @@ def _table(path: Path, rate_hz: float | None) -> PointTable:
     if suffix in (".csv", ".tsv", ".txt"):
         return read_csv(path, rate_hz)
     raise RecordingError(f"{path}: motion capture is read from {_FORMS}")
+
+
+def read_c3d(path: Path) -> PointTable:
+    """Read the labelled points of a C3D file (c3d.org), by py-c3d.
+
+    A point whose residual is negative was not seen.
+
+    Raises:
+        RecordingError: It cannot be read, or has no labelled points.
+    """
+    units: dict[str, Unit] = {"m": "m", "cm": "cm", "mm": "mm", "in": "in"}
+    broken = (
+        OSError,
+        ValueError,
+        LookupError,
+        AssertionError,
+        AttributeError,
+        TypeError,
+        struct.error,
+        EOFError,
+    )
+    try:
+        with path.open("rb") as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # it warns of files without analog channels
+            reader = cast(Any, c3d).Reader(file)
+            labels = [str(label).strip() for label in reader.point_labels]
+            rate_hz = float(reader.point_rate)
+            unit = str(reader.get("POINT:UNITS").string_value).strip().lower()
+            frames = [np.asarray(points, np.float64)[:, :4] for _, points, _ in reader.read_frames()]
+    except broken as error:
+        raise RecordingError(f"{path}: cannot read as C3D: {error or type(error).__name__}") from error
+    if not frames or not labels:
+        raise RecordingError(f"{path}: has no frames, or no points with labels")
+    points = np.stack(frames)[:, : len(labels)]
+    if not rate_hz > 0.0:
+        raise RecordingError(f"{path}: POINT:RATE is {rate_hz:g}: no frames a second")
+    labels = labels[: points.shape[1]]
+    named = [k for k, label in enumerate(labels) if label and labels.index(label) == k]
+    position = np.where(points[..., 3:4] < 0.0, np.nan, points[..., :3])[:, named]
+    t_s = np.arange(len(points)) / rate_hz
+    return PointTable(tuple(labels[k] for k in named), t_s, position, units.get(unit))
