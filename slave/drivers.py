@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import TypeVar
 
-REAL_CAMERAS = "picamera2[:INDEX] | v4l2[:DEVICE]"
+REAL_CAMERAS = "picamera2[:INDEX] | v4l2[:DEVICE] | opencv:INDEX"
 CAMERAS = f"{REAL_CAMERAS} | synthetic | replay:FOLDER"
 SERVICE = "service"  # a camera of `record`: that of the running slave
 REAL_IMUS = "ximu3:PORT[@BAUD] | lsm6dsox:BUS[:ADDRESS]"

@@ -103,7 +103,7 @@ def test_a_rig_is_tracked_and_what_is_not_there_is_said(
     assert summary["poses_per_s"] > 1.0
     for name in ("left", "right", "master"):
         assert (
-            "win32: nobody has tried it yet; not here: cameras on USB"
+            "win32: nobody has tried it yet; not here: cameras of a Pi (on USB: --camera opencv:INDEX)"
             in (tmp_path / f"{name}.log").read_text()
         )
 
@@ -113,7 +113,10 @@ def test_a_rig_is_tracked_and_what_is_not_there_is_said(
     [
         ("linux", ""),
         ("freebsd15", ""),
-        ("darwin", "darwin: nobody has tried it yet; not here: cameras on USB or a Pi, I2C, lights, demo"),
+        (
+            "darwin",
+            "darwin: nobody has tried it yet; not here: cameras of a Pi (on USB: --camera opencv:INDEX), I2C, lights, demo",
+        ),
         ("win32", "an orderly end of what console starts"),
     ],
 )

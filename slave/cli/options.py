@@ -60,7 +60,7 @@ def add_camera(command: ArgumentParser) -> None:
     pi("--sync", choices=("off", "server", "client"), default="off", help=text)
     text = "how long to wait for them (default: %(default)s)"
     pi("--sync-timeout", type=float, default=60.0, metavar="S", help=text)
-    usb = command.add_argument_group("USB camera (v4l2)").add_argument
+    usb = command.add_argument_group("USB camera (v4l2; opencv, on macOS and Windows)").add_argument
     for name, metavar, text in (
         ("--control", "NAME=N", "fix a control in codes of its maker, for example gain=32"),
         (

@@ -22,6 +22,7 @@ from common.clock import Clock, SkewedClock, SystemClock
 from common.errors import CalibrationError, CameraError, ImuError, LightsError, PhalanxError, TrackerError
 from common.imu.fusion import OrientationFilter
 from slave.cameras.grey import Pixels
+from slave.cameras.opencv import OpencvCamera
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
 from slave.drivers import CAMERAS, IMUS, LIGHTS, REAL_IMUS, REAL_TRACKERS, SWITCHED_LIGHTS, TRACKERS
@@ -106,7 +107,7 @@ def secrets_of(options: argparse.Namespace) -> "tuple[LinkKey, Access]":
 
 
 SYNTHETIC = "synthetic"
-REAL_CAMERAS = ("picamera2", "v4l2")
+REAL_CAMERAS = ("picamera2", "v4l2", "opencv")
 
 
 def driver_of(option: str, value: str, forms: str, error: type[PhalanxError]) -> tuple[str, str]:
@@ -139,16 +140,18 @@ def open_camera(
     kind, _, place = driver.partition(":")
     pixels = _pixels(kind, options.luma, wrist)
     # Option -> its driver, and the value that means "not given".
-    owners: dict[str, tuple[str, object]] = {
-        "sync": ("picamera2", "off"),
-        "sync_timeout": ("picamera2", 60.0),
-        "control": ("v4l2", []),
-        "allow_missing": ("v4l2", []),
+    owners: dict[str, tuple[tuple[str, ...], object]] = {
+        "sync": (("picamera2",), "off"),
+        "sync_timeout": (("picamera2",), 60.0),
+        "control": (("v4l2", "opencv"), []),
+        "allow_missing": (("v4l2", "opencv"), []),
     }
-    for name, (owner, not_given) in owners.items():
-        if owner != kind and getattr(options, name) != not_given:
+    for name, (owned, not_given) in owners.items():
+        if kind not in owned and getattr(options, name) != not_given:
             flag = "--" + name.replace("_", "-")
-            raise CameraError(f"{flag} is an option of --camera {owner}, not of {driver}: leave it away")
+            raise CameraError(
+                f"{flag} is an option of --camera {' and '.join(owned)}, not of {driver}: leave it away"
+            )
     opener: Callable[[CameraCalibration], FrameSource]
     patience_s = LOST_PATIENCE_S
     if kind == "picamera2":
@@ -167,6 +170,11 @@ def open_camera(
         codes = _codes(options.control)
         usb = V4l2Options(device_path(place), codes, tuple(options.allow_missing), pixels)
         opener = lambda file: V4l2Camera(file, usb, clock)  # noqa: E731
+    elif kind == "opencv":
+        if not place.isdecimal():
+            raise CameraError(f"--camera {driver}: write opencv:INDEX, 0 for the first camera")
+        codes, missing = _codes(options.control), tuple(options.allow_missing)
+        opener = lambda file: OpencvCamera(file, int(place), codes, missing, clock, pixels)  # noqa: E731
     else:
         return None
     return _reconnecting(opener, camera, clock, stop, lambda what: connection_lost(what, patience_s))
@@ -415,10 +423,8 @@ def open_lights(lights: str, rig: RigCalibration) -> Interlock:
 
 
 def _pixels(kind: str, as_luma: bool, wrist: bool) -> Pixels:
-    if as_luma and kind not in REAL_CAMERAS:
-        raise CameraError(
-            f"--luma is an option of --camera {' and '.join(REAL_CAMERAS)}, not of {kind}: leave it away"
-        )
+    if as_luma and kind not in ("picamera2", "v4l2"):
+        raise CameraError(f"--luma is an option of --camera picamera2 and v4l2, not of {kind}: leave it away")
     if as_luma and not wrist:
         raise CameraError(
             "--luma: makes grey frames for a wrist device; this rig looks for painted markers, by colour"

@@ -180,9 +180,9 @@ def test_a_reader_that_stops_or_dies_costs_the_slave_nothing(rig: SharedRig, tmp
     killed.kill()
     killed.communicate()
     # while one stood still, the other had every frame that the slave drew
-    assert until(lambda: f"frames read by process {killed.pid} of user {os.geteuid()}, 0 dropped" in rig.log, UP_S), (
-        rig.log
-    )
+    assert until(
+        lambda: f"frames read by process {killed.pid} of user {os.geteuid()}, 0 dropped" in rig.log, UP_S
+    ), rig.log
     time.sleep(1.0)
     slow.send_signal(signal.SIGINT)
     output, _ = slow.communicate(timeout=UP_S)
