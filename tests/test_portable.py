@@ -115,7 +115,7 @@ def test_a_rig_is_tracked_and_what_is_not_there_is_said(
         ("freebsd15", ""),
         (
             "darwin",
-            "darwin: nobody has tried it yet; not here: cameras of a Pi (on USB: --camera opencv:INDEX), I2C, lights, demo",
+            "darwin: nobody has tried it yet; not here: cameras of a Pi (on USB: --camera opencv:INDEX), I2C",
         ),
         ("win32", "an orderly end of what console starts"),
     ],
