@@ -146,9 +146,25 @@ def _judge_camera(
     if isinstance(file, str):
         yield _absent(name, f"The file of camera {name} cannot be used: {file}", _MEND)
         return
+    sensor = file.sensor
     if file.intrinsics is None:
+        about = (
+            "" if sensor is None else f" That of a {sensor.title} sees some {sensor.view_deg[0]:.0f} degrees."
+        )
         yield _absent(
-            name, f"Camera {name}: its lens is not measured.", "`phalanx calibrate cameras intrinsics`."
+            name,
+            f"Camera {name}: its lens is not measured.{about}",
+            "`phalanx calibrate cameras intrinsics`.",
+        )
+    elif (
+        sensor is not None
+        and abs(file.intrinsics.fx_px / sensor.nominal.fx_px - 1.0) > 3.0 * sensor.focal_share
+    ):
+        yield _stale(
+            name,
+            f"The lens of camera {name} has {file.intrinsics.fx_px:.0f} pixels of focal length, a {sensor.title} has"
+            f" {sensor.nominal.fx_px:.0f}.",
+            "Measure it in the mode that is used; of another lens, take `sensor` out of its file.",
         )
     if used is not None and (file.width_px, file.height_px) != used.size_px:
         yield _stale(

@@ -56,7 +56,7 @@ _CAMERA = (
     Row("analogue_gain", "Gain", "", 1.0, 16.0, 2),
     Row("red_gain", "White balance, red", "", 0.2, 4.0, 2),
     Row("blue_gain", "White balance, blue", "", 0.2, 4.0, 2),
-    Row("frame_rate_hz", "Frame rate", "Hz", 5.0, 120.0, 0),
+    Row("frame_rate_hz", "Frame rate", "Hz", 5.0, 310.0, 1),
     Row("roi_margin", "Search margin", "", ROI_LEAST, ROI_MOST, 2),
 )
 _FILTER = (

@@ -54,6 +54,7 @@ def _plan(tree: Path) -> Plan:
     return plan_of(load_setups(tree, ("desk",)))
 
 
+SENSOR = {"sensor": json.loads((ROOT / "calib_json/cameras/ov5647-640x480.json").read_text())["sensor"]}
 LATER = {"intrinsics": _measured("2026-02-01")}
 # fmt: off
 CHANGES: list[tuple[str, str, str, Callable[[Path], None]]] = [
@@ -61,6 +62,10 @@ CHANGES: list[tuple[str, str, str, Callable[[Path], None]]] = [
     ("calibration_absent", "left", "cannot be used", lambda tree: _put(tree / "cameras/left.json", "{")),
     ("calibration_absent", "left", "lens is not measured",
      lambda tree: _edit(tree / "cameras/left.json", lambda file: file | {"intrinsics": None})),
+    ("calibration_absent", "left", "That of a Camera Module 1 sees some 53 degrees",
+     lambda tree: _edit(tree / "cameras/left.json", lambda file: file | SENSOR | {"intrinsics": None})),
+    ("calibration_stale", "left", "has 497 pixels of focal length, a Camera Module 1 has 643",
+     lambda tree: _edit(tree / "cameras/left.json", lambda file: file | SENSOR)),
     ("calibration_absent", "desk", "places",
      lambda tree: _edit(tree / "rigs/desk.json", lambda rig: rig | {"T_rig_camera": {}})),
     ("calibration_absent", "default-right", "hand",

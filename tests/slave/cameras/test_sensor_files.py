@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from common.calibration import CameraCalibration
+from common.calibration import CameraCalibration, load
 from common.calibration.camera import sensor_files
 from common.clock import SystemClock
 from common.errors import CameraError
@@ -177,3 +177,36 @@ def test_a_view_that_is_not_that_of_the_file_is_refused(monkeypatch: pytest.Monk
         CameraError, match=r"ScalerCrop: wanted 16, 0, 2560, 1920 px .sensor.crop_px: the view., got 576"
     ):
         Picamera2Camera(FILES["ov5647-640x480"], Picamera2Options(), SystemClock())
+
+
+def test_the_camera_of_the_shipped_wrist_device_is_a_mode_of_the_ov9281(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    file = load(ROOT / "calib_json/cameras/wrist.json", CameraCalibration)
+    install(monkeypatch, Sensor.of(PI_CAMERAS["ov9281"]))
+    source = Picamera2Camera(file, Picamera2Options(pixels=Pixels.GREY), SystemClock())
+    frame = source.read()
+    source.close()
+    assert frame is not None
+    assert frame.image.shape == (400, 640)
+    sensor = FILES["ov9281-640x400"].sensor
+    assert sensor is not None
+    assert file.intrinsics is not None
+    assert abs(file.intrinsics.fx_px / sensor.nominal.fx_px - 1.0) < sensor.focal_share
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_the_page_has_the_figures_of_the_files(name: str) -> None:
+    page, file = (ROOT / "docs/cameras.md").read_text(), FILES[name]
+    (row,) = (line for line in page.splitlines() if line.startswith(f"| `{name}` |"))
+    _, _, title, picture, rate, mode, view, row_us, _ = (part.strip() for part in row.split("|"))
+    sensor = file.sensor
+    assert sensor is not None
+    assert (title, picture) == (sensor.title, f"{file.width_px}x{file.height_px}")
+    assert rate == f"{file.frame_rate_hz:g}"
+    of_mode = f"{sensor.mode_px[0]}x{sensor.mode_px[1]}, {sensor.bits} bit, to {sensor.max_rate_hz:g} Hz"
+    assert mode == (of_mode if sensor.bits else "its driver")
+    assert view == f"{sensor.view_deg[0]:.0f}° x {sensor.view_deg[1]:.0f}°"
+    assert row_us == (
+        "not known" if sensor.shutter == "rolling" and not file.row_time_us else f"{file.row_time_us:g}"
+    )

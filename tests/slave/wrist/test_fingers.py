@@ -18,7 +18,7 @@ from slave.wrist.seams import search_bands_of
 from slave.wrist.strobe import lit
 from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW, renderer, scene
 
-BLACK = np.zeros((480, 640), dtype=np.uint8)
+BLACK = np.zeros((400, 640), dtype=np.uint8)
 
 
 def led_images(name: str, count: int, seed: int) -> list[tuple[float, Image]]:

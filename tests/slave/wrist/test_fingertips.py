@@ -95,7 +95,11 @@ def test_fingers_behind_what_they_grip_do_not_pass_for_folded_ones() -> None:
 
 def test_what_is_reported_says_how_sure_it_is() -> None:
     pulls: dict[bool, list[float]] = {True: [], False: []}
-    for name, seed, hand in (("curl@dark", 31, "default"), ("spread@indoor", 33, "default")):
+    for name, seed, hand in (
+        ("curl@dark", 31, "default"),
+        ("standard@dark", 38, "default"),
+        ("spread@indoor", 33, "default"),
+    ):
         for one in shown(name, seed, hand):
             tips, truth = found(one), one.tip_uv
             known = np.isfinite(tips.sigma_px)
@@ -140,7 +144,7 @@ def test_independent_joints_are_found_too() -> None:
 
 
 def test_without_its_laser_point_no_finger_has_a_tip() -> None:
-    one = shown("curl@dark", 31)[4]
+    one = shown("curl@dark", 31)[6]
     led = lit(one.led, one.ambient)
     laser_uv = laser_lines(lit(one.laser, one.ambient), separate(led, VIEW), VIEW).uv.copy()
     laser_uv[2] = np.nan
@@ -173,14 +177,14 @@ def test_a_mirrored_hand_has_mirrored_tips() -> None:
 
 @pytest.mark.parametrize("level", [0, 3, 255])
 def test_an_image_of_nothing_has_no_tips(level: int) -> None:
-    image = np.full((480, 640), level, dtype=np.uint8)
+    image = np.full((400, 640), level, dtype=np.uint8)
     tips = fingertips(image, image, LASER_UV, VIEW)
     assert np.isnan(tips.uv).all()
     assert np.isnan(tips.sigma_px).all()
 
 
 def test_noise_has_no_tips() -> None:
-    images = np.random.default_rng(5).integers(0, 255, (3, 480, 640), dtype=np.uint8)
+    images = np.random.default_rng(5).integers(0, 255, (3, 400, 640), dtype=np.uint8)
     none = np.zeros(5, np.bool_)
     assert np.isnan(found(Shown(images[0], images[1], images[2], np.full((5, 2), np.nan), none)).uv).all()
 

@@ -16,7 +16,7 @@ from slave.wrist.strobe import lit
 from slave.wrist.workspace import workspace_of
 from tests.slave.wrist.wrist_frames import VIEW, renderer, scene, seen_at
 
-BLACK = np.zeros((480, 640), dtype=np.uint8)
+BLACK = np.zeros((400, 640), dtype=np.uint8)
 INDEX = 1
 VISIBLE_M = 2e-3
 
@@ -26,7 +26,7 @@ def drawn(
 ) -> Image:
     """A Gaussian line; above 255 it is cut, as a sensor does."""
     u = np.arange(640.0)
-    v = np.arange(480.0)[:, None]
+    v = np.arange(400.0)[:, None]
     across = (v - row(u)) / np.hypot(1.0, np.gradient(row(u)))
     image = peak * np.exp(-0.5 * (across / sigma_px) ** 2) * ((u >= columns[0]) & (u <= columns[1]))
     return np.clip(image, 0.0, 255.0).astype(np.uint8)

@@ -144,7 +144,7 @@ def test_frames_recorded_by_the_command_are_read_back_as_they_were(
     assert [row.illumination for row in rows] == [lit[row.seq % 3] for row in rows]
     written = cv2.imread(str(out / rows[0].file), cv2.IMREAD_UNCHANGED)
     assert written is not None
-    assert written.shape == (480, 640)
+    assert written.shape == (400, 640)
     camera = ReplayCamera(out, "wrist", paced=False, clock=SystemClock())
     frame = camera.read()
     assert frame is not None

@@ -75,7 +75,7 @@ def test_of_one_instant_the_light_is_added_and_a_dark_room_shows_nothing_else() 
     renderer = WristRenderer(shown, "wrist")
     frames = {lit: renderer.render(9.0, lit) for lit in (AMBIENT, LASER, LED)}
     for image in frames.values():
-        assert image.shape == (480, 640)
+        assert image.shape == (400, 640)
         assert image.dtype == np.uint8
     assert abs(float(np.median(frames[AMBIENT])) - 2.0) <= 1.0  # the black level
     assert frames[AMBIENT].max() < 12

@@ -304,5 +304,5 @@ def test_the_device_is_one_that_could_be_built() -> None:
         assert laser.baseline == pytest.approx(0.030, abs=0.001)  # Kim et al. 2012: 3 cm, 105 degrees
         assert laser.fan_rad == pytest.approx(np.radians(105.0))
         optics = CameraModel.of(CAMERAS["wrist"], np.eye(4))
-        assert (optics.width_px, optics.height_px, CAMERAS["wrist"].frame_rate_hz) == (640, 480, 90.0)
+        assert (optics.width_px, optics.height_px, CAMERAS["wrist"].frame_rate_hz) == (640, 400, 90.0)
         assert isinstance(scene("curl").sheet, LaserSheet)

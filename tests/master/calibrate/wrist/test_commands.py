@@ -211,7 +211,7 @@ def broken(boards: Path, folder: Path, what: str) -> Path:
     shutil.copytree(boards, folder)
     if what == "dark":
         for file in (folder / "wrist").iterdir():
-            cv2.imwrite(str(file), np.full((480, 640), 2, np.uint8))
+            cv2.imwrite(str(file), np.full((400, 640), 2, np.uint8))
     elif what == "slipped":  # the labels are one frame off
         table = (folder / FRAMES).read_text()
         table = table.replace(",laser,", ",x,").replace(",ambient,", ",laser,").replace(",led,", ",ambient,")

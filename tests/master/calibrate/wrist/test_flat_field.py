@@ -13,7 +13,7 @@ from master.calibrate.wrist.flat_field import WhiteSamples, fit_flat_field, whit
 from tests.master.calibrate.wrist.devices import BOARD, OPTICS, scene_of, view_of
 
 AMBIENT, LED = Illumination.AMBIENT, Illumination.LED
-V, U = np.mgrid[20:480:20, 20:640:20].astype(np.float64)
+V, U = np.mgrid[10:400:20, 20:640:20].astype(np.float64)
 EVERYWHERE = np.stack([U.ravel(), V.ravel()], axis=1)
 
 
@@ -68,7 +68,7 @@ def test_shine_on_a_tenth_of_the_paper_changes_little() -> None:
 
 def test_where_no_paper_was_the_field_stays_sane() -> None:
     # Only the middle cells' inner parts: the corners of the image are beyond every sample.
-    inner = EVERYWHERE[(np.abs(EVERYWHERE - [320, 240]) < [240, 180]).all(axis=1)]
+    inner = EVERYWHERE[(np.abs(EVERYWHERE - [320, 200]) < [240, 150]).all(axis=1)]
     fit = fit_flat_field(samples(2, where=inner), OPTICS)
     xy = OPTICS.undistort(EVERYWHERE)
     assert worst_percent(field_at(fit.field, xy), truth(xy)) < 25.0
@@ -80,8 +80,8 @@ def test_where_no_paper_was_the_field_stays_sane() -> None:
     [((0, 0), "top left"), ((1, 0), "top right"), ((0, 1), "bottom left"), ((1, 1), "bottom right")],
 )
 def test_a_corner_without_paper_is_named(corner: tuple[int, int], name: str) -> None:
-    at = np.array([640, 480]) * np.array(corner)
-    far = (np.abs(EVERYWHERE - at) > [214, 161]).any(axis=1)
+    at = np.array([640, 400]) * np.array(corner)
+    far = (np.abs(EVERYWHERE - at) > [214, 134]).any(axis=1)
     with pytest.raises(FitError, match=f"no white squares at the {name} of the image"):
         fit_flat_field(samples(where=EVERYWHERE[far]), OPTICS)
 

@@ -180,7 +180,7 @@ def lit_in_the_laser_frame(seed: int, count: int, *, board_apart: bool) -> tuple
 
 @pytest.mark.parametrize("board_apart", [False, True])
 def test_a_board_that_is_lit_in_the_laser_frame_needs_no_ambient_one(*, board_apart: bool) -> None:
-    seed = 11
+    seed = 9
     fit = fit_plane(lines_of(lit_in_the_laser_frame(seed, 6, board_apart=board_apart), BOARD, OPTICS)[0])
     true = plane_of(seed)
     assert fit.used.sum() >= 5  # one is too steep for the finder, by whatever light

@@ -24,7 +24,7 @@ CHARUCO = Charuco(9, 6, 0.015, 0.011)
 
 
 def rendered() -> tuple[LitView, ...]:
-    return tuple(view_of(str(k), frames) for k, frames in enumerate(cycles_of(11, 2)))
+    return tuple(view_of(str(k), frames) for k, frames in enumerate(cycles_of(8, 2)))
 
 
 def printed(board: Charuco, change: Callable[[Image], Image] = lambda image: image) -> tuple[LitView, ...]:
