@@ -15,7 +15,7 @@ from pathlib import Path
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.calibration.camera import Sensor, sensor_files
 from common.clock import SystemClock
-from common.errors import CameraError, PhalanxError
+from common.errors import CalibrationError, CameraError, PhalanxError
 from slave.cameras.picamera2 import offered
 from slave.cameras.picamera2_streams import SensorMode, choose_mode, choose_raw_mode
 from slave.cameras.settings import Setting, differences
@@ -158,7 +158,11 @@ def check_camera(slave: argparse.Namespace, taken: bool) -> Iterator[Finding]:
 def _offers(slave: argparse.Namespace) -> Iterator[Finding]:
     """What the camera can do, and which shipped files fit it."""
     kind, _, place = str(slave.camera).partition(":")
-    files = {n: (one, one.sensor) for n, one in sensor_files(slave.calibration).items() if one.sensor}
+    files, broken = dict[str, tuple[CameraCalibration, Sensor]](), ""
+    try:
+        files |= {n: (one, one.sensor) for n, one in sensor_files(slave.calibration).items() if one.sensor}
+    except CalibrationError as error:
+        broken = str(error)
     if kind == "picamera2":
         model, modes = offered(int(place) if place.isdecimal() else 0)
         own = {name: one for name, one in files.items() if one[1].fits(model)}
@@ -174,7 +178,9 @@ def _offers(slave: argparse.Namespace) -> Iterator[Finding]:
         own = {name: one for name, one in files.items() if one[1].driver == kind}
     yield ok("camera modes", f"{model}: {text}")
     fit = [name for name, one in own.items() if _fits(*one, modes, offers)]
-    if fit:
+    if broken:
+        yield fail("camera files", broken, "copy calib_json/cameras from the PC again")
+    elif fit:
         yield ok("camera files", f"shipped ones that fit: {', '.join(fit)}")
     else:
         fix = "write one of a mode above, as docs/cameras.md has it"

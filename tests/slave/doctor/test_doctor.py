@@ -474,6 +474,11 @@ def test_a_rigs_file_of_a_mode_that_the_sensor_lacks_is_wrong_with_the_nearest_a
     for path in (tree / "cameras").glob("ov5647-*.json"):
         path.unlink()
     assert camera_findings(monkeypatch, tree, "picamera2", fits)["camera files"].verdict is Verdict.WARN
+    (tree / "cameras/imx219-640x480.json").write_text("{")
+    found = camera_findings(monkeypatch, tree, "picamera2", fits)
+    assert found["camera"].verdict is Verdict.OK
+    assert "640x480 10 bit, up to 58.9 Hz" in found["camera modes"].text
+    assert "imx219-640x480.json" in found["camera files"].text
 
 
 def test_what_a_usb_camera_offers_is_listed_as_its_driver_has_it(
