@@ -338,7 +338,7 @@ def unsided(marker: str) -> str:
 
 
 def painted_alike(markers: Sequence[str]) -> dict[str, str]:
-    """Marker -> the first that may be painted like it: itself, or that of another hand."""
+    """Marker -> the first that may be painted like it: itself, or another hand's."""
     return {marker: next(one for one in markers if unsided(one) == unsided(marker)) for marker in markers}
 
 

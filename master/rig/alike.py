@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
+from math import log
 from typing import NamedTuple
 
 import numpy as np
@@ -27,8 +28,9 @@ from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import quaternion_to_matrix
 from common.hand.model import WRIST, HandModel
+from common.kernels import inner, kernel
 from common.messages import HandPose, MarkerDetections
-from master.estimator.sensors import CameraArrays
+from master.estimator.sensors import CameraArrays, project
 from master.fabrik.intersection import triangulate
 from master.rig.setup import RigSetup
 
@@ -70,13 +72,89 @@ _WAYS = {
 }
 
 
-def _minus_2_log(d: Float, S: Float, most: Float) -> Float:
-    """-2 log likelihood (K, n), but for a constant, of d (K, n, m) with covariance S.
+@inner
+def _cost(a: float, b: float, c: float, x: float, y: float) -> float:
+    """-2 log likelihood, but for a constant, of (x, y) with covariance a, b; b, c."""
+    det = a * c - b * b
+    return (c * x * x - 2.0 * b * x * y + a * y * y) / det + log(det)
 
-    `most`: (K, 1), what replaces a greater one; 0 where d is NaN.
+
+@kernel
+def costs(
+    cameras: CameraArrays,
+    which: Int,
+    since_s: Float,
+    row_s: Float,
+    points: Float,
+    velocity: Float,
+    cov: Float,
+    uv: Float,
+    variance_px2: Float,
+    out: Float,
+) -> None:
+    """Write what it costs that blobs i and j of two frames are a hand's.
+
+    Args:
+        which: (2,) the cameras of the two frames.
+        since_s: (2,) from the points' time to the frames' first row [s]; row_s: (2,) from row to row.
+        points, velocity, cov: (K, 3) [m], (K, 3) [m/s], (K, 3, 3) [m^2] of the hand's markers.
+        uv: (2, K, 2, 2) [px] blobs of the frames, NaN: none; variance_px2: (2, K) of them.
+        out: (K, 3, 3); i or j 2: none, which costs nothing.
     """
-    cost = ((d @ np.linalg.inv(S)) * d).sum(axis=-1) + np.linalg.slogdet(S)[1][:, None]
-    return np.where(np.isfinite(d[..., 0]), np.minimum(cost, most), 0.0)
+    px, J, S, point = np.empty((2, 2)), np.empty((2, 2, 3)), np.empty((4, 4)), np.empty(3)
+    for k in range(len(points)):
+        known, process = np.isfinite(cov[k, 0, 0]), 0.0
+        for n in range(2):
+            known = known and project(cameras, which[n], points[k], px[n], J[n])
+            tau = since_s[n] + row_s[n] * px[n, 1]
+            for axis in range(3):
+                ahead_s = min(max(tau, -ALIKE.velocity_s), ALIKE.velocity_s)
+                point[axis] = points[k, axis] + ahead_s * velocity[k, axis]
+            known = known and project(cameras, which[n], point, px[n], J[n])
+            process = max(process, ALIKE.place_m**2 + (0.5 * ALIKE.acceleration_m_s2 * tau * tau) ** 2)
+        for i in range(4):
+            for j in range(4):
+                total = variance_px2[i // 2, k] if i == j else 0.0
+                for m in range(3):
+                    for n in range(3):
+                        noise = process if m == n else 0.0
+                        total += J[i // 2, i % 2, m] * (cov[k, m, n] + noise) * J[j // 2, j % 2, n]
+                S[i, j] = total
+        out[k] = 0.0
+        for n in range(2):
+            for i in range(2):
+                x, y = uv[n, k, i, 0] - px[n, 0], uv[n, k, i, 1] - px[n, 1]
+                a, b, c = S[2 * n, 2 * n], S[2 * n, 2 * n + 1], S[2 * n + 1, 2 * n + 1]
+                value = min(_cost(a, b, c, x, y), ALIKE.most) if known else ALIKE.absent
+                if np.isfinite(uv[n, k, i, 0]):
+                    out[k, i if n == 0 else 2, i if n == 1 else 2] = value
+        det = S[0, 0] * S[1, 1] - S[0, 1] * S[0, 1]
+        for i in range(2):
+            for j in range(2):
+                out[k, i, j] = out[k, i, 2] + out[k, 2, j]
+                x, y = uv[0, k, i, 0] - px[0, 0], uv[0, k, i, 1] - px[0, 1]
+                if not known or not np.isfinite(x + uv[1, k, j, 0]):
+                    continue
+                # of the second, what the first leaves open
+                u, v = (S[1, 1] * x - S[0, 1] * y) / det, (S[0, 0] * y - S[0, 1] * x) / det
+                x2 = uv[1, k, j, 0] - px[1, 0] - S[2, 0] * u - S[2, 1] * v
+                y2 = uv[1, k, j, 1] - px[1, 1] - S[3, 0] * u - S[3, 1] * v
+                a = S[2, 2] - _through(S, det, 2, 2)
+                b = S[2, 3] - _through(S, det, 2, 3)
+                c = S[3, 3] - _through(S, det, 3, 3)
+                both = _cost(S[0, 0], S[0, 1], S[1, 1], x, y) + _cost(a, b, c, x2, y2)
+                apart = ALIKE.most + min(out[k, i, 2], out[k, 2, j])  # one of them is something else
+                out[k, i, j] = min(both, apart)
+
+
+@inner
+def _through(S: Float, det: float, i: int, j: int) -> float:
+    """S_i A^-1 S_j of rows i and j with the first two, whose covariance is A."""
+    return (
+        S[1, 1] * S[i, 0] * S[j, 0]
+        - S[0, 1] * (S[i, 0] * S[j, 1] + S[i, 1] * S[j, 0])
+        + S[0, 0] * S[i, 1] * S[j, 1]
+    ) / det
 
 
 @dataclass(slots=True)
@@ -126,51 +204,25 @@ class _Hand:
         out[marker] = points_m
         return out
 
-    def expected(self, frame: "_Frame", h: int) -> tuple[Float, Float, Float]:
-        """Where a frame's paints are of this hand, the rig's hand `h`.
-
-        Returns pixels (K, 2), their derivative (K, 2, 3) [px/m] and the covariance (K, 3, 3) [m^2] of the point.
-        """
-        marker, model = frame.camera.marker[:, h], frame.camera.model
-        points = self.points_m[marker]
+    def costs(self, cameras: CameraArrays, now: "_Frame", other: "_Frame | None", h: int) -> Float:
+        """As `costs` (K, 3, 3), of the rig's hand `h`; `other` None: no other frame."""
         assert self.t_ns is not None
-        tau = (frame.t_ns + model.row_time_ns * np.nan_to_num(model.project(points)[:, 1]) - self.t_ns) * 1e-9
-        ahead = np.clip(tau, -ALIKE.velocity_s, ALIKE.velocity_s)
-        points = points + ahead[:, None] * self.velocity_m_s[marker]
-        process = ALIKE.place_m**2 + (0.5 * ALIKE.acceleration_m_s2 * tau**2) ** 2
-        R = model.T_rig_camera[:3, :3].T
-        x, y, z = (R @ (points - model.centre).T).clip([[-np.inf], [-np.inf], [0.01]])
-        J = np.zeros((len(points), 2, 3))
-        J[:, 0, 0], J[:, 0, 2], J[:, 1, 1], J[:, 1, 2] = 1.0 / z, -x / z**2, 1.0 / z, -y / z**2
-        cov = self.cov_m2[marker] + process[:, None, None] * np.eye(3)
-        # a marker of which nothing is known is expected nowhere near
-        return np.nan_to_num(model.project(points), nan=1e4), float(model.matrix[0, 0]) * J @ R, cov
-
-    def costs(self, now: "_Frame", other: "_Frame | None", h: int) -> Float:
-        """What it costs that this hand's are blob i of `now` and blob j of `other`.
-
-        Returns (K, 3, 3); i or j 2: none, which costs nothing.
-        """
-        expected, J, cov = self.expected(now, h)
-        off, sigma2 = (now.uv - expected[:, None])[:, :, None].repeat(2, axis=2), now.variance_px2[:, None]
-        if other is not None:
-            expected, J_there, _ = self.expected(other, h)
-            there = (other.uv - expected[:, None])[:, None].repeat(2, axis=1)
-            off, J = np.concatenate([off, there], axis=-1), np.concatenate([J, J_there], axis=1)
-            sigma2 = np.stack([now.variance_px2, other.variance_px2], axis=1)
-        S = J @ cov @ J.transpose(0, 2, 1) + np.eye(J.shape[1]) * sigma2.repeat(2, axis=1)[:, None]
-        known = np.isfinite(S.sum(axis=(1, 2)))[:, None, None]
-        off = np.where(known[..., None] | np.isnan(off), off, 1e4)
-        S, absent = np.where(known, S, np.eye(J.shape[1])), np.where(known, np.inf, ALIKE.absent)
-        C = np.zeros((len(off), 3, 3))
-        C[:, :2, 2] = _minus_2_log(off[:, :, 0, :2], S[:, :2, :2], np.minimum(absent[..., 0], ALIKE.most))
-        if other is not None:
-            C[:, 2, :2] = _minus_2_log(off[:, 0, :, 2:], S[:, 2:, 2:], np.minimum(absent[..., 0], ALIKE.most))
-            both = _minus_2_log(off.reshape(-1, 4, 4), S, 2.0 * absent[..., 0]).reshape(-1, 2, 2)
-            apart = ALIKE.most + np.minimum(C[:, :2, 2:], C[:, 2:, :2])  # one of them is something else
-            here, away = np.isfinite(off[..., 0]), np.isfinite(off[..., 2])
-            C[:, :2, :2] = np.where(here & away, np.minimum(both, apart), C[:, :2, 2:] + C[:, 2:, :2])
-        return C
+        frames, marker = (now, other or now), now.camera.marker[:, h]
+        uv = np.stack([now.uv, np.full_like(now.uv, np.nan) if other is None else other.uv])
+        out = np.empty((len(marker), 3, 3))
+        costs(
+            cameras,
+            np.array([one.camera.place for one in frames]),
+            np.array([one.t_ns - self.t_ns for one in frames]) * 1e-9,
+            np.array([one.camera.model.row_time_ns for one in frames]) * 1e-9,
+            self.points_m[marker],
+            self.velocity_m_s[marker],
+            self.cov_m2[marker],
+            uv,
+            np.stack([one.variance_px2 for one in frames]),
+            out,
+        )
+        return out
 
     def side_of(self, points_m: Float, towards: Float) -> float:
         """How surely points (M, 3) are of this hand's side, 1, or of the other's, -1.
@@ -305,7 +357,7 @@ class AlikeHands:
         own = np.zeros((*seen.shape, 2))
         for h, hand in enumerate(self._hands):
             if known[h]:
-                cost = hand.costs(now, other, h)
+                cost = hand.costs(self._cameras, now, other, h)
                 own[..., h] = cost[:, :2, 2]
                 blob = np.where((ways == h).any(axis=1), (ways == h).argmax(axis=1), 2)
                 total = total + (cost[:, blob][:, :, blob] if other is not None else cost[:, blob, 2:])
