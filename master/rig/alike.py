@@ -55,6 +55,7 @@ class AlikeSettings(NamedTuple):
     apart_periods: float = 1.5  # between the frames of two cameras that show one hand
     meet_px: float = 8.0  # by which their rays may miss each other: 1 m/s between the frames
     least: int = 4  # markers from which a hand can begin
+    hand_m: float = 0.15  # of a marker from the middle of its hand's
     hand_m2: float = 0.03  # sum of squared distances from the middle that a second hand must save
     ambiguous_m2: float = 0.004  # by which the next grouping must be worse
     side: float = 1.0  # sum over frames of how surely the hands have their sides
@@ -464,10 +465,17 @@ class AlikeHands:
         if rest and rest[0] - best < ALIKE.ambiguous_m2:
             return unclear
         groups = points[spread.argmin()]
-        lone = np.isnan(groups[..., 0]).any(axis=0) & np.isfinite(groups[..., 0]).any(axis=1).all()
-        return np.where(
-            lone[:, None], np.nan, groups
-        ), marker  # of two hands, what one shows alone may be the other's
+        if not np.isfinite(groups[..., 0]).any(axis=1).all():
+            return groups, marker
+        # What one of two hands shows alone may be a blob of each: then it lies beside both, or as near to the other.
+        away = np.linalg.norm(groups[:, None] - np.nanmean(groups, axis=1)[None, :, None], axis=3)
+        nearest, farthest = (
+            np.nanmin(away, axis=(0, 1), initial=np.inf),
+            np.nanmax(away, axis=(0, 1), initial=0.0),
+        )
+        lone = np.isnan(groups[..., 0]).any(axis=0)
+        lone &= (nearest > ALIKE.hand_m) | (farthest < nearest + ALIKE.hand_m / 2.0)
+        return np.where(lone[:, None], np.nan, groups), marker
 
 
 def _options(P: Float, hands: int) -> list[Float]:
