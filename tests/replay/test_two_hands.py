@@ -74,8 +74,8 @@ def crossing(tmp_path_factory: pytest.TempPathFactory) -> tuple[Replay, dict[str
     folder = tmp_path_factory.mktemp("crossing")
     hands = (scene, *scene.others)
     alone = {one.rig.hand: replace(one, others=(), watched=None) for one in hands}
-    runs = {name: played(folder / name, one, 1.2, 4.6) for name, one in alone.items()}
-    return played(folder / "both", scene, 1.2, 4.6), runs
+    runs = {name: played(folder / name, one, 0.5, 5.3) for name, one in alone.items()}
+    return played(folder / "both", scene, 0.5, 5.3), runs
 
 
 def test_hands_that_cross_at_ten_centimetres_never_swap(crossing: tuple[Replay, dict[str, Replay]]) -> None:
@@ -101,6 +101,7 @@ def test_each_hand_is_as_good_as_alone(crossing: tuple[Replay, dict[str, Replay]
             single[rows[valid]] = 1e3 * off[valid]
         found = error_mm(both, hand, joints)
         shown = np.isfinite(single) & ~hidden_by_other(both, alone[hand], suffix)
+        shown[:48] = False  # 0.8 s: alone it begins a frame earlier, with all its markers
         assert np.isfinite(found[shown]).mean() > 0.98, f"{hand} is published"
         assert np.nanmean(found[shown]) <= 1.2 * single[shown].mean(), hand
 
