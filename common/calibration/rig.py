@@ -332,7 +332,7 @@ def _check_imu(imu: ImuCalibration, cameras: tuple[str, ...], where: str) -> Non
 
 
 def unsided(marker: str) -> str:
-    """The marker on any hand: `thumb` of `left_thumb`; what is called alike may be painted alike."""
+    """The marker on any hand: `thumb` of `left_thumb`; they may be painted alike."""
     side, _, name = marker.partition("_")
     return name if name and side in get_args(Side) else marker
 

@@ -1,4 +1,5 @@
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -65,8 +66,14 @@ def test_own_range_test_equals_opencv_at_the_wrap() -> None:
     np.testing.assert_array_equal(in_range(hsv, WRAPPED), by_opencv(image, WRAPPED))
 
 
+def test_markers_of_one_paint_share_a_bit() -> None:
+    table = ColourTable([PLAIN, WRAPPED, PLAIN])
+    assert table.bits == (1, 2, 1)
+    assert table.skin == 4
+
+
 def test_more_than_eight_markers_get_wider_codes_and_keep_their_bits() -> None:
-    ranges = [PLAIN] * 11 + [WRAPPED]
+    ranges = [msgspec.structs.replace(PLAIN, hsv_low=(*PLAIN.hsv_low[:2], k)) for k in range(11)] + [WRAPPED]
     table = ColourTable(ranges)
     image = np.random.default_rng(4).integers(0, 256, (30, 30, 3), np.uint8)
     codes = table.codes(image)
