@@ -113,7 +113,7 @@ def test_a_quote_is_what_the_template_says_and_not_what_is_filled_in() -> None:
 
 
 def test_what_no_program_prints_is_no_quote() -> None:
-    assert printed("Camera left: its lens is not measured.", goes_on=False)
+    assert printed("Camera left: its lens is not measured.", goes_on=True)
     assert not printed("Camera left: its lens is dirty.", goes_on=False)
     assert not printed("Camera left: its lens is not", goes_on=False)
     assert not printed("the camera is broken", goes_on=True)

@@ -13,6 +13,7 @@ import pytest
 
 from slave.__main__ import main
 from tests.slave import fake_picamera2 as fake
+from tests.slave.recorded_lists import IMX219
 
 
 class LockedCamera(fake.Picamera2):
@@ -40,6 +41,6 @@ class LockedCamera(fake.Picamera2):
 
 if __name__ == "__main__":
     LockedCamera.lock = Path(sys.argv[1])
-    fake.install(pytest.MonkeyPatch(), fake.Sensor(modes=fake.IMX219, start_ns=time.monotonic_ns()))
+    fake.install(pytest.MonkeyPatch(), fake.Sensor(modes=IMX219, start_ns=time.monotonic_ns()))
     sys.modules["picamera2"].Picamera2 = LockedCamera  # pyright: ignore[reportAttributeAccessIssue]
     sys.exit(main(sys.argv[2:]))
