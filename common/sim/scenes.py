@@ -188,7 +188,13 @@ def scene_by_name(
             f"scene {name!r}: shows markers, and rig {rig.name!r} is of kind {rig.kind!r}; that has {WRIST_NAMES}"
         )
     if rig.other_hands:
-        return _of_hands(name, rig, cameras, (hand, *others), seed)
+        if name not in (TWO_HANDS, "standard"):
+            raise PhalanxError(
+                f"scene {name!r}: shows one hand, rig {rig.name!r} watches several: {TWO_HANDS}"
+            )
+        hands = dict(zip((rig.hand, *rig.other_hands), (hand, *others), strict=True))
+        parts = [(own, hands[one]) for one, own, _ in rigs_by_hand(rig, hands)]
+        return replace(scene_of_hands(parts, cameras, seed), watched=rig)
     if name in ("standard", "lights"):
         scene = Scene.standard(rig, cameras, hand, seed, objects)
         return scene if name == "standard" else replace(scene, light=ROOM)
@@ -205,25 +211,15 @@ def scene_by_name(
     return Scene.of_motion(rig, cameras, hand, motion, seed, objects, cards)
 
 
-def _of_hands(
-    name: str,
-    rig: RigCalibration,
-    cameras: Mapping[str, CameraCalibration],
-    hands: Sequence[HandProfile],
-    seed: int,
+def scene_of_hands(
+    parts: Sequence[tuple[RigCalibration, HandProfile]], cameras: Mapping[str, CameraCalibration], seed: int
 ) -> Scene:
-    """Scene of a rig of several hands; raises as `scene_by_name`."""
-    if name not in (TWO_HANDS, "standard"):
-        raise PhalanxError(f"scene {name!r}: shows one hand, rig {rig.name!r} watches several: {TWO_HANDS}")
-    profiles = dict(zip((rig.hand, *rig.other_hands), hands, strict=True))
-    parts = rigs_by_hand(rig, profiles)
-    first, *more = (
-        Scene.of_motion(
-            own, cameras, profiles[one], TwoHands(HandModel.of(profiles[one]), view_centre(rig), seed), seed
-        )
-        for one, own, _ in parts
+    """Two hands that cross, each with its part of the rig; raises as `Scene.of_motion`."""
+    first, *others = (
+        Scene.of_motion(rig, cameras, hand, TwoHands(HandModel.of(hand), view_centre(rig), seed), seed)
+        for rig, hand in parts
     )
-    return replace(first, others=tuple(more), watched=rig)
+    return replace(first, others=tuple(others))
 
 
 def view_by_name(

@@ -3,7 +3,7 @@
 A simulated run is compared with the exact scene at its poses: figures, a picture and a Rerun file.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -18,7 +18,7 @@ from common.geometry.transforms import quaternion_to_matrix
 from common.recording.frame_recording import Illumination
 from common.sim.render import Renderer
 from common.sim.scene import Scene
-from common.sim.scenes import scene_by_name
+from common.sim.scenes import scene_by_name, scene_of_hands
 from common.sim.two_rigs import TWO_RIG_SCENES
 from common.sim.wrist.motion import OnForearm
 from common.sim.wrist.render import WristRenderer
@@ -121,8 +121,10 @@ class Played:
     two_rigs: bool = False  # the scene is one for both kinds of rig, whether or not there are both
 
     @classmethod
-    def of(cls, setup: RigSetup, name: str, seed: int) -> "Played":
+    def of(cls, setup: RigSetup, name: str, seed: int, beside: Sequence[RigSetup] = ()) -> "Played":
         """The scene called `name`; with @LIGHT behind it that of a wrist device.
+
+        `beside`: the other hands before the same cameras.
 
         Raises:
             PhalanxError: There is no such scene for this kind of rig, or it is not one motion for both kinds.
@@ -130,6 +132,9 @@ class Played:
         moves, hand = name.partition("@")[0], setup.hand.profile
         watched = {one.name: one for one in setup.objects}
         two_rigs = moves in TWO_RIG_SCENES
+        if beside:
+            parts = [(one.rig, one.hand.profile) for one in (setup, *beside)]
+            return cls(scene_of_hands(parts, setup.cameras, seed))
         if setup.wrist_rig is None:
             return cls(scene_by_name(name, setup.rig, setup.cameras, hand, seed, watched), None, two_rigs)
         wrist_scene = WristScene.by_name(name, setup.wrist_rig, setup.cameras, hand, seed)
