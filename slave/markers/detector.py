@@ -166,7 +166,7 @@ class MarkerDetector:
         scanned = self._look(image, t_ns, windows)
         blobs = scanned.blobs
         chosen = self._decide(scanned, windows)
-        blobs = [self._but_of_others(m, options, chosen) for m, options in enumerate(blobs)]
+        blobs = [self._but_of_others(m, blobs[rows[0]], chosen) for m, rows in enumerate(self._alike)]
         self.ambiguity.push(blobs, chosen)
         self._initial_uv = {}
         rows = list(chosen)

@@ -76,11 +76,12 @@ def connected(blobs: Sequence[Blob]) -> bool:
     return True
 
 
-def choose(candidates: Sequence[Candidate]) -> dict[int, Candidate]:
+def choose(candidates: Sequence[Candidate], *, second: bool = True) -> dict[int, Candidate]:
     """Choose the markers among the candidates: marker row -> candidate.
 
     A marker without a plausible blob is absent. The best group is a hand; markers that it lacks may be on a second
-    hand, a group of at least `SECOND_HAND` markers with skin. Less than that is clutter that happens to lie together.
+    hand, a group of at least `SECOND_HAND` markers with skin, unless `second` is False. Less than that is clutter that
+    happens to lie together.
     """
     links = _links(candidates)
     rest = set(range(len(candidates)))
@@ -100,12 +101,14 @@ def choose(candidates: Sequence[Candidate]) -> dict[int, Candidate]:
         for i in rest
         if (taken := found.get(candidates[i].marker)) is None or (taken.fringe and not candidates[i].fringe)
     }
-    second = [candidates[i] for i in _best_group(candidates, links, free)]
-    second = [c for c in second if c.blob.area >= SPECK or c.bonus >= TRACKED]
-    solid = [c for c in second if c.skin >= 2.0 * SKINLESS or c.bonus >= TRACKED]
+    if not second:
+        return found
+    more = [candidates[i] for i in _best_group(candidates, links, free)]
+    more = [c for c in more if c.blob.area >= SPECK or c.bonus >= TRACKED]
+    solid = [c for c in more if c.skin >= 2.0 * SKINLESS or c.bonus >= TRACKED]
     if len(solid) >= SECOND_HAND:
         markers = {c.marker for c in solid}
-        found |= {c.marker: c for c in second if c.marker in markers or not _strange(c, solid)}
+        found |= {c.marker: c for c in more if c.marker in markers or not _strange(c, solid)}
     return found
 
 
@@ -114,15 +117,20 @@ def choose_all(candidates: Sequence[Candidate], slots: Mapping[int, int]) -> lis
 
     Markers on a further hand, painted alike, are those of a group that is one by itself, or tracked.
     """
-    found = list(choose(candidates).values())
-    for hand in range(1, max(slots.values(), default=1)):
-        taken = {id(c.blob) for c in found}
-        rest = [c for c in candidates if slots.get(c.marker, 1) > hand and id(c.blob) not in taken]
-        group = list(choose(rest).values())
+    hands = max(slots.values(), default=1)
+    if hands == 1:
+        return list(choose(candidates).values())
+    found: list[Candidate] = []
+    for _ in range(2 * hands):  # a hand may fall in two groups
+        taken = [c.marker for c in found]
+        rest = [c for c in candidates if c not in found and taken.count(c.marker) < slots.get(c.marker, 1)]
+        group = list(choose(rest, second=False).values())
         solid = [
             c for c in group if c.blob.area >= SPECK and (c.skin >= 2.0 * SKINLESS or c.bonus >= TRACKED)
         ]
-        found += [c for c in group if len(solid) >= SECOND_HAND or c.bonus >= TRACKED]
+        # the second is there: what is left of either may lie with the other's
+        there = not found or len(solid) >= SECOND_HAND or len(taken) - len(set(taken)) >= SECOND_HAND
+        found += [c for c in group if c.bonus >= TRACKED or (there and (not found or c.blob.area >= SPECK))]
     return found
 
 

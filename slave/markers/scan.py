@@ -71,14 +71,14 @@ class Scanner:
     def whole(self, image: Image, table: ColourTable) -> Scanned:
         """Scan a frame; for colours that show nowhere also further grids, in turn."""
         codes, blobs = self._scan(image, table, table.bits, SCALE, 0, 0, None)
-        missing = [m for m, options in enumerate(blobs) if not options]
+        missing = _missing(table, blobs)
         if missing:
             codes = codes.copy()  # the next scan reuses it
             step, dx, dy = OTHERS[self._cycle] if self.began else FINER
             self._cycle = (self._cycle + 1) % len(OTHERS)
             _, finer = self._scan(image, table, [table.bits[m] for m in missing], step, dx, dy, None)
             for m, options in zip(missing, finer, strict=True):
-                blobs[m] = options
+                blobs[m] = _with(blobs[m], options)
         elif not self.began:
             self._cycle = 0
         return Scanned([((0, 0, self._columns, self._rows), codes)], blobs)
@@ -102,12 +102,12 @@ class Scanner:
         else:
             return self.whole(image, table)
         found = _gathered([blobs for _, _, blobs in scanned], len(windows))
-        missing = [m for m, options in enumerate(found) if not options]
+        missing = _missing(table, found)
         for m in missing:
             if m in wanted or m in proposed:
                 step, dx, dy = FINER if m in proposed else OTHERS[self._cycle]
                 seen = [self._on_grid(image, table, [table.bits[m]], part, step, dx, dy)[1] for part in parts]
-                found[m] = _gathered(seen, 1)[0]
+                found[m] = _with(found[m], _gathered(seen, 1)[0])
         if missing:
             self._cycle = (self._cycle + 1) % len(OTHERS)
         return Scanned([(part, codes) for part, codes, _ in scanned], found)
@@ -161,6 +161,17 @@ class Scanner:
                 ):
                     clipped.append(blob)
         return clipped
+
+
+def _missing(table: ColourTable, blobs: Sequence[Sequence[Blob]]) -> list[int]:
+    """Markers of whose paint there are fewer blobs than markers."""
+    return [m for m, options in enumerate(blobs) if len(options) < table.bits.count(table.bits[m])]
+
+
+def _with(blobs: list[Blob], more: list[Blob]) -> list[Blob]:
+    """Add blobs of another grid to those of a colour that they are not: the largest first."""
+    new = [one for one in more if not any(one.meets(blob) for blob in blobs)]
+    return sorted([*blobs, *new], key=lambda blob: -blob.area)[:MAX_CANDIDATES] if blobs else new
 
 
 def _reach(blob: Blob) -> float:
