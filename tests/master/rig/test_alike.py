@@ -134,10 +134,10 @@ def test_one_blob_between_two_markers_is_nobodys() -> None:
 
 def test_hands_begin_by_their_sides_whatever_the_rows_say() -> None:
     counts = Counter[str]()
-    alike = AlikeHands.of(BOTH, counts)
+    alike, t_s = AlikeHands.of(BOTH, counts), 0.3
     assert alike is not None
-    for k in range(6):
-        t_s = 0.3 + k / 60.0
+    left = right = seen_by("left", t_s)
+    for t_s in (0.3 + np.arange(6) / 60.0).tolist():
         left = alike.push(seen_by("left", t_s, swapped=(0, 3, 5)))
         right = alike.push(seen_by("right", t_s + 0.005, swapped=(1, 3)))
     assert_rows(left, seen_by("left", t_s))
@@ -152,8 +152,9 @@ def test_a_lone_hand_is_named_by_its_side(hand: int, rows: tuple[int, ...]) -> N
     assert alike is not None
     first = alike.push(seen_by("left", 0.3, [hand], rows))
     assert np.isnan(first.uv).all(), "of one camera nothing is known"
+    out = first
     for k in range(1, 6):
-        out = alike.push(seen_by("right", 0.3 + k / 60.0 - 0.01, [hand], rows))
+        alike.push(seen_by("right", 0.3 + k / 60.0 - 0.01, [hand], rows))
         out = alike.push(seen_by("left", 0.3 + k / 60.0, [hand], rows))
     assert_rows(out, seen_by("left", 0.3 + 5 / 60.0, [hand]))
 
@@ -161,6 +162,7 @@ def test_a_lone_hand_is_named_by_its_side(hand: int, rows: tuple[int, ...]) -> N
 def test_a_hand_that_enters_takes_no_marker_of_the_other() -> None:
     alike = AlikeHands.of(BOTH, Counter())
     assert alike is not None
+    out = exact = seen_by("left", 0.3)
     for k in range(8):
         t_s = 0.3 + k / 60.0
         hands = [1] if k < 3 else [0, 1]
