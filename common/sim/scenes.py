@@ -214,7 +214,7 @@ def scene_by_name(
 def scene_of_hands(
     parts: Sequence[tuple[RigCalibration, HandProfile]], cameras: Mapping[str, CameraCalibration], seed: int
 ) -> Scene:
-    """Two hands that cross, each with its part of the rig; raises as `Scene.of_motion`."""
+    """Two hands that cross, each with its part of the rig. As `Scene.of_motion`."""
     first, *others = (
         Scene.of_motion(rig, cameras, hand, TwoHands(HandModel.of(hand), view_centre(rig), seed), seed)
         for rig, hand in parts

@@ -169,7 +169,7 @@ def _missing(table: ColourTable, blobs: Sequence[Sequence[Blob]]) -> list[int]:
 
 
 def _with(blobs: list[Blob], more: list[Blob]) -> list[Blob]:
-    """Add blobs of another grid to those of a colour that they are not: the largest first."""
+    """Add blobs of another grid to those of a colour, the largest first."""
     new = [one for one in more if not any(one.meets(blob) for blob in blobs)]
     return sorted([*blobs, *new], key=lambda blob: -blob.area)[:MAX_CANDIDATES] if blobs else new
 
