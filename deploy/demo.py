@@ -34,6 +34,7 @@ TWO_RIG_SCENES = ("grasp", "both-poses", "both-curl", "both-travel", "both-moves
 _BEST = {
     **dict.fromkeys(TWO_RIG_SCENES, ("desk-back3", "wrist-back3")),
     "object": ("desk-wand",),
+    "hands": ("desk-both",),
     "gestures": ("desk4",),  # fingers that bend towards one pair are seen by the other
 }
 
