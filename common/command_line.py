@@ -38,7 +38,8 @@ def remark(text: str) -> None:
 
 # What is written for Linux alone, by `sys.platform`; tests/elsewhere.py lists its files.
 _NOT_HERE: dict[str, str] = dict.fromkeys(
-    ("darwin", "win32"), "cameras of a Pi (on USB: --camera opencv:INDEX), I2C, lights, demo, run --install, fleet"
+    ("darwin", "win32"),
+    "cameras of a Pi (on USB: --camera opencv:INDEX), I2C, lights, demo, run --install, fleet",
 )
 _NOT_HERE["win32"] += (
     ", IMUs on serial ports, libsurvive, private files of keys, an orderly end of what console starts"

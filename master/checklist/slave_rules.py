@@ -5,7 +5,7 @@ colour, a range of colours or a cap is wrong:
 
 1. It was seen, its colours were changed, and now it is not: that was the change. Reported after 0.9 s.
 2. It was never seen since this slave, or these colours, began: a hand soon shows all of its caps. After 5 s.
-3. It has not been seen for as long as no pose hides it: `GONE_S`. The cap has come off, or is dirty.
+3. It has not been seen for as long as no pose hides it: 30 s. The cap has come off, or is dirty.
 
 Only time counts in which at least three others (all, of a hand with fewer) are found in half of the frames.
 """
@@ -18,7 +18,6 @@ from common.calibration.camera_settings import WANTED
 from master.checklist.facts import CameraPlan, SlaveReports, Verdict, Window, beyond
 from master.checklist.link_rules import disk_verdict
 
-GONE_S = 30.0
 COLOUR = "colour."  # metrics of the slave: a number that changes with the range of a marker
 SEEN = "seen."
 
@@ -35,8 +34,8 @@ class _Marker:
     @property
     def limit_s(self) -> float:
         """How long it may be missing."""
-        changed_s, never_s = 0.9, 5.0
-        return GONE_S if self.ever else changed_s if self.before_change else never_s
+        changed_s, never_s, gone_s = 0.9, 5.0, 30.0
+        return gone_s if self.ever else changed_s if self.before_change else never_s
 
     @property
     def since(self) -> str:
