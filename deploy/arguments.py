@@ -56,7 +56,8 @@ def _add_scene(demo: ArgumentParser) -> None:
         action="append",
         metavar="NAME",
         help="once for each that runs; default: desk, for scenes of both kinds desk-back3 (three markers on the back "
-        "determine how the palm lies) and wrist-back3 of the same hand, for object desk-wand, for gestures desk4, for two hands (--scene hands) desk-both; "
+        "determine how the palm lies) and wrist-back3 of the same hand, for object desk-wand, for gestures desk4, "
+        "for two hands (--scene hands) desk-both; "
         "desk-fabrik is desk with the card's line alone; desk-cube and desk-tracker track objects, too; "
         "--rig desk --rig wrist has one hand",
     )
