@@ -3,14 +3,18 @@
 import time
 from pathlib import Path
 
-from master.rig.setup import load_setup
+from master.rig.setup import load_setups
 from master.run.dispatcher import new_dispatcher
 
 
 def main() -> None:
-    """Compile what the shipped rig calls, or find it compiled."""
-    setup, began_s = load_setup(Path("calib_json"), "desk"), time.process_time()
-    new_dispatcher([setup])
+    """Compile what the shipped rigs of one hand and of two call, or find it compiled."""
+    rigs, began_s = (
+        [load_setups(Path("calib_json"), (name,)) for name in ("desk", "desk-both")],
+        time.process_time(),
+    )
+    for setups in rigs:
+        new_dispatcher(setups)
     print(f"kernels are compiled ({time.process_time() - began_s:.0f} s)")
 
 

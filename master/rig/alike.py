@@ -293,6 +293,11 @@ class AlikeHands:
         self._last: dict[int, _Frame] = {}
         self._seen: dict[int, Bool] = {}  # camera -> (K, 2) whether it saw each hand's marker of a paint
         self._lean, self._lean_ns, self._lean_places = 0.0, 0, np.zeros((2, 3))
+        point, at = np.full((1, 3), np.nan), np.zeros(2)
+        seen, out = (np.zeros((2, 1, 2, 2)), np.ones((2, 1))), np.empty((1, 3, 3))
+        costs(
+            self._cameras, np.zeros(2, np.intp), at, at, point, point, np.eye(3)[None], *seen, out
+        )  # compiled now
 
     @classmethod
     def of(cls, setups: Sequence[RigSetup], counts: Counter[str]) -> "AlikeHands | None":
