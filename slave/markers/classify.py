@@ -40,6 +40,7 @@ class ColourTable:
 
     Attributes:
         bits: Of each marker; those of one paint, on two hands, share one.
+        sharing: Of each marker how many have its bit.
         entries: (2^24,) codes of 1, 2, 4 or 8 bytes, at the sum of the `places` of blue, green and red.
         places: (3, 256) what each byte of blue, green and red adds to the index.
     """
@@ -51,6 +52,7 @@ class ColourTable:
         distinct = {(one.hsv_low, one.hsv_high): one for one in ranges}
         order = list(distinct)
         self.bits = tuple(1 << order.index((one.hsv_low, one.hsv_high)) for one in ranges)
+        self.sharing = tuple(self.bits.count(bit) for bit in self.bits)
         self.skin = 1 << len(order)
         self.entries = _build([*distinct.values(), SKIN])
         self.places = _places(np.tile(np.arange(256, dtype=np.uint8), (3, 1)))

@@ -134,6 +134,7 @@ class MarkerDetector:
             rows_of.setdefault(bit, []).append(m)
         self._colours = list(rows_of.values())  # rows of each colour: of one marker, or of one on every hand
         self._alike = [rows_of[bit] for bit in self.table.bits]
+        self._shared = len(self._colours) < len(markers)
         self._tracks: list[Track | None] = [None] * len(markers)
         self._scanner = Scanner(camera.width_px, camera.height_px, engine)
         self._last_ns: int | None = None  # time of the last frame
@@ -166,7 +167,8 @@ class MarkerDetector:
         scanned = self._look(image, t_ns, windows)
         blobs = scanned.blobs
         chosen = self._decide(scanned, windows)
-        blobs = [self._but_of_others(m, blobs[rows[0]], chosen) for m, rows in enumerate(self._alike)]
+        if self._shared:
+            blobs = [self._but_of_others(m, blobs[rows[0]], chosen) for m, rows in enumerate(self._alike)]
         self.ambiguity.push(blobs, chosen)
         self._initial_uv = {}
         rows = list(chosen)
@@ -185,7 +187,8 @@ class MarkerDetector:
         # An alternative costs as much as a marker, so only two are measured in one frame.
         closely = sorted(alternatives, key=lambda m: -alternatives[m].area)[:2]
         asked = [(m, chosen[m]) for m in rows] + [(m, alternatives[m]) for m in closely]
-        alone = [len(every) == 1 or _alone(blob, every) for m, blob in asked for every in [scanned.blobs[m]]]
+        every = scanned.blobs
+        alone = [len(every[m]) == 1 or _alone(blob, every[m]) for m, blob in asked]
         bits = [self.table.bits[m] for m, _ in asked]
         measured = self._engine.measure(image, self.table, bits, [blob for _, blob in asked], alone)
         for m, seen in zip(closely, measured[len(rows) :], strict=True):
@@ -198,8 +201,9 @@ class MarkerDetector:
             for m, seen in zip(rows, measured, strict=False)
             if seen is not None and not (seen.thin and (seen.foreign > fringe or seen.area < sliver))
         }
-        for m in [m for m, seen in seen_as.items() if self._merged(m, seen, chosen, windows)]:
-            del seen_as[m]
+        if self._shared:
+            for m in [m for m, seen in seen_as.items() if self._merged(m, seen, chosen, windows)]:
+                del seen_as[m]
         self.evidence, self._frame = {}, self._frame + 1
         due = {m for m in seen_as if alive[m] is None}
         outlines = outlines_of(image, seen_as, due, self._outlined, self._frame)
@@ -305,8 +309,6 @@ class MarkerDetector:
 
     def _but_of_others(self, m: int, options: list[Blob], chosen: Mapping[int, Blob]) -> list[Blob]:
         """The blobs of a marker's colour without those of its like on other hands."""
-        if len(self._alike[m]) == 1:
-            return options
         taken = [chosen[n] for n in self._alike[m] if n != m and n in chosen]
         return [blob for blob in options if all(blob is not other for other in taken)]
 
@@ -354,11 +356,12 @@ class MarkerDetector:
             options = blobs[rows[0]]
             if not options:
                 continue
-            known = {m: window for m in rows if (window := windows[m]) is not None}
-            found = assigned(known, options) if known else {}
-            tracked |= found
-            certain &= len(found) == min(len(rows), len(options))
-            certain &= not any(self._sudden(m, blob) for m, blob in found.items())
+            found = assigned(rows, windows, options)
+            certain = certain and len(found) in (len(rows), len(options))
+            for m, blob in found.items():
+                tracked[m] = blob
+                track = self._tracks[m]
+                certain = certain and not (track is not None and track.sudden(blob))
         if certain and connected([blob for m, blob in tracked.items() if m not in self._free]):
             return tracked
         candidates: list[Candidate] = []

@@ -165,7 +165,7 @@ class Scanner:
 
 def _missing(table: ColourTable, blobs: Sequence[Sequence[Blob]]) -> list[int]:
     """Markers of whose paint there are fewer blobs than markers."""
-    return [m for m, options in enumerate(blobs) if len(options) < table.bits.count(table.bits[m])]
+    return [m for m, options in enumerate(blobs) if len(options) < table.sharing[m]]
 
 
 def _with(blobs: list[Blob], more: list[Blob]) -> list[Blob]:

@@ -20,7 +20,7 @@ Deviation of the centroid [px]: independent causes, added in squares (numbers of
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import permutations
 from typing import NamedTuple, cast
 
@@ -57,24 +57,24 @@ class Window(NamedTuple):
         return math.hypot(x, y) / self.margin + 0.5 * abs(math.log(blob.area / self.area))
 
 
-def assigned(windows: Mapping[int, Window], blobs: Sequence[Blob]) -> dict[int, Blob]:
-    """Give each of some windows, by row, the blob that is its own, at the least cost.
+def assigned(rows: Sequence[int], windows: Sequence[Window | None], blobs: Sequence[Blob]) -> dict[int, Blob]:
+    """Give each of some markers, by its window, the blob that is its own, at the least cost.
 
-    One that finds none costs as much as any blob that it can; each blob is of one window.
+    One that finds none costs as much as any blob that it can; each blob is of one marker. `windows`: of all markers.
     """
-    rows = tuple(windows)
-    if len(rows) == 1:
-        cost, k = min((windows[rows[0]].cost(blob), k) for k, blob in enumerate(blobs))
+    if len(rows) == 1 and (window := windows[rows[0]]) is not None:
+        cost, k = min([(window.cost(blob), k) for k, blob in enumerate(blobs)])
         return {rows[0]: blobs[k]} if math.isfinite(cost) else {}
+    known = {m: window for m in rows if (window := windows[m]) is not None}
     lost = 3.0  # cost of a marker that is not seen: more than that of any blob in its window
-    costs = [[min(windows[m].cost(blob), lost) for blob in blobs] + [lost] * len(rows) for m in rows]
-    columns = range(len(blobs) + len(rows))
+    costs = [[min(w.cost(blob), lost) for blob in blobs] + [lost] * len(known) for w in known.values()]
+    columns = range(len(blobs) + len(known))
     best = min(
-        permutations(columns, len(rows)),
+        permutations(columns, len(known)),
         key=lambda ks: sum(own[k] for own, k in zip(costs, ks, strict=True)),
         default=(),
     )
-    pairs = zip(rows, costs, best, strict=False)
+    pairs = zip(known, costs, best, strict=False)
     return {m: blobs[k] for m, own, k in pairs if k < len(blobs) and own[k] < lost}
 
 
