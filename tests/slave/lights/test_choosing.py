@@ -74,7 +74,7 @@ def test_no_lights_without_limits() -> None:
             {"exposure_us": 5000.0},
             "exposure_us 5000: needs light for 6200 us, strobe.max_pulse_us of rig 'wrist' is 5000",
         ),
-        ({"row_time_us": 20.0}, "row_time_us 20 .9600 us for all rows.*would reach into the next frame"),
+        ({"row_time_us": 20.0}, "row_time_us 20 .8000 us for all rows.*would reach into the next frame"),
         ({"frame_rate_hz": 130.0}, "for 0.139 of the time, strobe.max_duty of rig 'wrist' is 0.12"),
     ],
 )
