@@ -80,8 +80,8 @@ def add_simulated(command: ArgumentParser) -> None:
         default="standard",
         metavar="NAME",
         help=f"standard | lights | poses | hand-routine | object | leap:FILE.npz | {BOTH} | hands | board | card; "
-        f"before a wrist device standard | curl | subject | poses | spread | random | {BOTH}, each with @dark | @indoor | "
-        "@bright | @sun, or board",
+        f"before a wrist device standard | curl | subject | poses | spread | random | {BOTH}, each with @dark | "
+        "@indoor | @bright | @sun, or board",
     )
     add("--seed", type=int, default=7, metavar="N", help="of the scene (default: %(default)s)")
     add(
