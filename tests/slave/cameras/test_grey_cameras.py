@@ -279,11 +279,14 @@ def test_pictures_of_grey_frames_for_whoever_looks() -> None:
 
 def strobed_camera() -> Camera:
     """A camera of 10 bits before a strobed hand."""
-    return mono("Y10", pictures=[frame.image for frame in strobed("curl", 8)], padding=32)
+    pictures = [frame.image for frame in strobed("curl", 8)]
+    camera = mono("Y10", pictures=pictures, padding=32)
+    camera.formats = {"Y10": {(pictures[0].shape[1], pictures[0].shape[0]): (RATE_HZ,)}}
+    return camera
 
 
 def test_a_hand_before_a_real_camera_is_found_as_in_the_same_pictures_of_8_bits() -> None:
-    source, wire = usb(strobed_camera()), Wire(WristDetections)
+    source, wire = usb(strobed_camera(), height_px=strobed("curl", 1)[0].image.shape[0]), Wire(WristDetections)
     detector = WristDetector(VIEW, RATE_HZ)
     taken = (frame for _ in range(12) if (frame := source.read()) is not None)
     run(
