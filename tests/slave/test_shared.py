@@ -1,5 +1,6 @@
 """A slave gives its frames to programs of its machine: to the last bit, without waiting, and to nobody else."""
 
+import grp
 import os
 import socket
 import subprocess
