@@ -58,7 +58,7 @@ class Window(NamedTuple):
 
 
 def assigned(rows: Sequence[int], windows: Sequence[Window | None], blobs: Sequence[Blob]) -> dict[int, Blob]:
-    """Give each of some markers, by its window, the blob that is its own, at the least cost.
+    """Give each of some markers, by its window, its own blob, at the least cost.
 
     One that finds none costs as much as any blob that it can; each blob is of one marker. `windows`: of all markers.
     """
