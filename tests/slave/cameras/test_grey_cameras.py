@@ -286,7 +286,10 @@ def strobed_camera() -> Camera:
 
 
 def test_a_hand_before_a_real_camera_is_found_as_in_the_same_pictures_of_8_bits() -> None:
-    source, wire = usb(strobed_camera(), height_px=strobed("curl", 1)[0].image.shape[0]), Wire(WristDetections)
+    source, wire = (
+        usb(strobed_camera(), height_px=strobed("curl", 1)[0].image.shape[0]),
+        Wire(WristDetections),
+    )
     detector = WristDetector(VIEW, RATE_HZ)
     taken = (frame for _ in range(12) if (frame := source.read()) is not None)
     run(
