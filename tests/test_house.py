@@ -136,7 +136,7 @@ FIRST_LINE, FILE_LINES = 79, 580
 SHARED = frozenset({"common"})  # nothing enters or leaves the language of both sides
 # No more than there are: each change leaves fewer.
 MODULE_CONSTANTS, PROTOCOLS = 560, 11
-FILES, LINES, FOLDER_FILES, BENCH_LINES = 450, 105_567, 20, 9_064
+FILES, LINES, FOLDER_FILES, BENCH_LINES = 450, 105_566, 20, 9_064
 # Calls that touch the world; none may run because a module is imported.
 DEVICES = frozenset(
     {

@@ -33,8 +33,8 @@ def report(words: Sequence[str]) -> None:
         hand = setup.hand.profile.name
         file, folder = (path_of_hand(options.poses, hand), out / hand) if number else (options.poses, out)
         folder.mkdir(parents=True, exist_ok=True)
-        beside = [one for one in setups if one is not setup and one.rows and setup.rows]
-        played = Played.of(setup, options.scene, options.seed, beside)
+        others = [one for one in setups if one is not setup and one.rows and setup.rows]
+        played = Played.of(setup, options.scene, options.seed, others)
         full = report_scene(file, setup, played, options.scene_epoch_ns, folder, figures, progress)
         write_summary(folder / "summary.json", full)
     echo()

@@ -335,7 +335,7 @@ class AlikeHands:
         self._last[camera.place] = now
         return self._ordered(message, camera, owner)
 
-    def _beside(self, frames: Mapping[int, _Frame], now: _Frame) -> _Frame | None:
+    def _nearest_frame(self, frames: Mapping[int, _Frame], now: _Frame) -> _Frame | None:
         """The nearest frame of another camera; None: too long ago, or of other paints."""
         others = [one for place, one in frames.items() if place != now.camera.place]
         other = min(others, key=lambda one: abs(one.t_ns - now.t_ns), default=now)
@@ -353,7 +353,7 @@ class AlikeHands:
 
     def _owners(self, now: _Frame) -> Int:
         """Whose each blob (K, 2) is: a hand's, `_LEFT` over, or `_UNCLEAR`."""
-        known, other = self._known(now.t_ns), self._beside(self._last, now)
+        known, other = self._known(now.t_ns), self._nearest_frame(self._last, now)
         ways = _WAYS[sum(known) if sum(known) != 1 else -1 - known.index(True)]
         seen, row = np.isfinite(now.uv[..., 0]), np.arange(len(now.uv))
         left = (ways == _LEFT).astype(np.float64).T * ALIKE.absent
@@ -401,7 +401,7 @@ class AlikeHands:
 
     def _begin(self, now: _Frame, known: Sequence[bool]) -> bool:
         """Let hands that are not known begin with what is left over, if that is clear."""
-        if (other := self._beside(self._left, now)) is None:
+        if (other := self._nearest_frame(self._left, now)) is None:
             return False
         groups, marker = self._groups(now, other, 2 - sum(known))
         if not np.isfinite(groups).any():

@@ -101,20 +101,19 @@ class OpencvCamera:
     ) -> None:
         camera, wanted, got = self._calibration, list[Setting](), dict[str, object]()
 
-        def want(name: str, number: int, value: float, tolerance: float, source: str) -> None:
+        def want(name: str, number: int, value: float, source: str) -> None:
             capture.set(number, value)
-            wanted.append(Setting(name, (value,), tolerance, "", source))
+            wanted.append(Setting(name, (value,), 0.0, "", source))
             got[name] = capture.get(number)
 
-        want("width_px", cv2.CAP_PROP_FRAME_WIDTH, camera.width_px, 0.0, "camera file")
-        want("height_px", cv2.CAP_PROP_FRAME_HEIGHT, camera.height_px, 0.0, "camera file")
-        capture.set(
-            cv2.CAP_PROP_FPS, camera.frame_rate_hz
-        )  # what it says of it is not true of all; it is measured
+        want("width_px", cv2.CAP_PROP_FRAME_WIDTH, camera.width_px, "camera file")
+        want("height_px", cv2.CAP_PROP_FRAME_HEIGHT, camera.height_px, "camera file")
+        # What a driver says of its rate is not always true: it is measured.
+        capture.set(cv2.CAP_PROP_FPS, camera.frame_rate_hz)
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         for name, number in _AUTOMATICS.items():
             if capture.get(number) > 0.0:
-                want(name, number, 0.0, 0.0, "every automatic is off")
+                want(name, number, 0.0, "every automatic is off")
         if not exposes and "exposure" not in missing:
             raise CameraError(
                 "exposure_us: this system sets none; --allow-missing exposure takes its automatic"
@@ -128,7 +127,7 @@ class OpencvCamera:
                 raise CameraError(
                     f"exposure_us {camera.exposure_us:g}: the nearest is {made_us:g}; write that"
                 )
-            want("exposure", cv2.CAP_PROP_EXPOSURE, code, 0.0, f"exposure_us {camera.exposure_us:g}")
+            want("exposure", cv2.CAP_PROP_EXPOSURE, code, f"exposure_us {camera.exposure_us:g}")
         if unknown := sorted({*codes} - {*_CODES}):
             raise CameraError(f"--control {unknown[0]}: not one of {', '.join(_CODES)}")
         for key, control in _NEEDS.items():
@@ -137,7 +136,7 @@ class OpencvCamera:
                     f"{key}: give its code, --control {control}=NUMBER, or --allow-missing {key}"
                 )
         for control, code in codes.items():
-            want(control, _CODES[control], code, 0.0, f"--control {control}={code}")
+            want(control, _CODES[control], code, f"--control {control}={code}")
         demand("the camera", wanted, got, "Another camera may: see docs/cameras.md")
 
     def _settle(self, capture: cv2.VideoCapture) -> None:
